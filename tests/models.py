@@ -1,0 +1,91 @@
+"""Jump Markov models for tests, small and asymmetric."""
+
+import numpy as np
+
+from hybridtrack.estimators import _bank
+from hybridtrack.models import JumpMarkovModel, Mode, ModeBank
+
+
+def figure_5_model(dimensions=2):
+    """The bank of Hwang 2006, section 5, with an asymmetric transition matrix."""
+    names = ("x", "vx", "ax", "y", "vy", "ay")[: 3 * dimensions]
+    R = 17.7**2 * np.eye(dimensions)
+    modes = (
+        Mode("CV", "constant_velocity_zero_acceleration", {"acceleration_std_m_s2": 0.2}, R),
+        Mode("CT", "wiener_acceleration", {"acceleration_std_m_s2": 3.0}, R),
+    )
+    matrix = np.array([[0.95, 0.05], [0.15, 0.85]])
+    bank = ModeBank(modes, names, dimensions, matrix, None, np.array([0.9, 0.1]))
+    start = np.diag([17.7**2, 100.0, 1e-6] * dimensions)
+    mean = np.array([0.0, 240.0, 0.0, 0.0, 50.0, 0.0])[: 3 * dimensions]
+    return bank.discretise(np.ones(1), mean, start)
+
+
+def random_model(rng, n_modes=3, n_x=4, n_y=2, n_times=1):
+    """Full matrices everywhere: correlated noise, H and R of each mode its own, inputs."""
+
+    def covariance(*shape):
+        root = rng.normal(size=shape + shape[-1:])
+        return root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(shape[-1])
+
+    matrix = rng.random((n_times, n_modes, n_modes)) ** 2 + 0.02
+    F = np.eye(n_x) + 0.3 * rng.normal(size=(n_times, n_modes, n_x, n_x))
+    F *= 0.9 / np.maximum(np.linalg.norm(F, 2, axis=(-2, -1)), 0.9)[..., None, None]
+    F[..., 0, n_x - 1] = 0.0
+    mu = rng.random(n_modes) + 0.05
+    return JumpMarkovModel(
+        state_transition=F,
+        input_effect=rng.normal(size=(n_times, n_modes, n_x)),
+        process_noise_covariance=covariance(n_times, n_modes, n_x),
+        measurement_matrix=rng.normal(size=(n_modes, n_y, n_x)),
+        measurement_noise_covariance=covariance(n_modes, n_y),
+        transition_matrix=matrix / matrix.sum(axis=-1, keepdims=True),
+        initial_mode_probabilities=mu / mu.sum(),
+        initial_mean=rng.normal(size=n_x),
+        initial_covariance=covariance(n_x),
+        step_s=np.ones(n_times),
+        mode_names=tuple(f"m{j}" for j in range(n_modes)),
+        state_names=tuple(f"s{e}" for e in range(n_x)),
+    )
+
+
+def slice_times(model, steps):
+    """The model of a span of steps."""
+    names = ("state_transition", "input_effect", "process_noise_covariance", "transition_matrix")
+    return model._replace(
+        **{name: getattr(model, name)[steps] for name in names if len(getattr(model, name)) > 1}
+    )
+
+
+def run_kernel(model, z, recursion=None, spans=None, known=None, initial_mean=None):
+    """Filter z (steps, n_y, lanes); returns Estimates (with everything) and the last state."""
+    steps, _, lanes = z.shape
+    state = _bank.start(model, lanes, initial_mean)
+    work = _bank.workspace(model, lanes)
+    spans = spans or [slice(0, steps)]
+    parts = []
+    for span in spans:
+        part = slice_times(model, span)
+        n = len(z[span])
+        out = _bank.empty_estimates(part, n, lanes, likelihoods=True, covariance=True)
+        known_modes = _bank.NO_KNOWN_MODES if known is None else known[span]
+        _bank.run_span(
+            state,
+            work,
+            _bank.kernel_model(part),
+            recursion or _bank.Recursion(),
+            np.ascontiguousarray(z[span]),
+            out,
+            known_modes,
+        )
+        parts.append(out)
+    return _bank.Estimates(*(np.concatenate(p) for p in zip(*parts, strict=True))), state
+
+
+def unpacked(covariance, n_x):
+    """(n_packed, ...) to (n_x, n_x, ...)."""
+    a, c = np.tril_indices(n_x)
+    full = np.empty((n_x, n_x, *covariance.shape[1:]))
+    full[a, c] = covariance
+    full[c, a] = covariance
+    return full
