@@ -252,7 +252,7 @@ def test_hand_case_of_one_step():
     state.mean[:, 0, 0] = 0.0, 10.0
     state.covariance[:, 0, 0] = 1.0
     state.mode_probabilities[:, 0] = 0.25, 0.75
-    _bank.combine(state, work, out.mean[0], out.covariance[0])
+    _bank.combine(state, out.mean[0], out.covariance[0])
     np.testing.assert_allclose(out.mean[0, 0, 0], 7.5, rtol=1e-14)
     np.testing.assert_allclose(out.covariance[0, 0, 0], 19.75, rtol=1e-14)
 

@@ -390,9 +390,7 @@ def _update_by_combination(mean, covariance, h, variance, y, squared, scale, wor
             if h[e] != 0.0:
                 _add_scaled(products[a], h[e], covariance[_packed(a, e)])
     _apply(expected_variance, h, products, 0.0)
-    _innovate(
-        y, expected, 1.0, variance, expected_variance, innovation, inverse, squared, scale
-    )
+    _innovate(y, expected, 1.0, variance, expected_variance, innovation, inverse, squared, scale)
     for a in range(n_x):
         for b in range(innovation.size):
             gains[a, b] = products[a, b] * inverse[b]
@@ -561,24 +559,28 @@ def know_modes(state, known):
 
 
 @kernel
-def combine(state, work, mean, covariance):
+def combine(state, mean, covariance):
     """The estimate: the mean (n_x, lanes) of the mixture, and its covariance if wanted."""
     n_modes, n_x = state.mean.shape[:2]
-    if covariance.shape[0]:
-        total, share = work.rows[0], work.rows[1]
-        mean[:] = state.mean[0]
-        covariance[:] = state.covariance[0]
-        _copy(total, state.mode_probabilities[0])
-        for i in range(1, n_modes):
-            _merge_share(total, share, 1.0, state.mode_probabilities[i])
-            _merge(mean, covariance, share, state.mean[i], state.covariance[i], work.states[0])
-        return
     for e in range(n_x):
         for b in range(mean.shape[1]):
             mean[e, b] = state.mode_probabilities[0, b] * state.mean[0, e, b]
         for i in range(1, n_modes):
             for b in range(mean.shape[1]):
                 mean[e, b] += state.mode_probabilities[i, b] * state.mean[i, e, b]
+    if covariance.shape[0]:
+        t = 0
+        for a in range(n_x):
+            for c in range(a + 1):
+                _fill(covariance[t], 0.0)
+                for i in range(n_modes):
+                    for b in range(mean.shape[1]):
+                        covariance[t, b] += state.mode_probabilities[i, b] * (
+                            state.covariance[i, t, b]
+                            + (state.mean[i, a, b] - mean[a, b])
+                            * (state.mean[i, c, b] - mean[c, b])
+                        )
+                t += 1
 
 
 @kernel
@@ -632,7 +634,7 @@ def advance(state, work, model, choices, measurements, known_modes, estimates):
         covariance = no_covariance
         if estimates.covariance.shape[0]:
             covariance = estimates.covariance[k]
-        combine(state, work, estimates.mean[k], covariance)
+        combine(state, estimates.mean[k], covariance)
         probabilities = estimates.mode_probabilities[k]
         for o in range(probabilities.shape[0]):
             _fill(probabilities[o], 0.0)
@@ -717,6 +719,7 @@ def empty_estimates(
     """Room for the estimates of a span."""
     n_x = len(model.state_names)
     n_modes = len(output_modes(model))
+    likelihoods = likelihoods and n_modes == len(model.mode_names)
     return Estimates(
         mean=np.empty((steps, n_x, lanes)),
         mode_probabilities=np.empty((steps, n_modes, lanes)),

@@ -1,0 +1,318 @@
+"""One block of runs: truth -> measurements -> estimates -> running statistics."""
+
+import threading
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridtrack.config import Experiment, Window
+from hybridtrack.estimators import Estimates, Running
+from hybridtrack.executors import Stopped
+from hybridtrack.models import Array, JumpMarkovModel
+from hybridtrack.simulation import (
+    BLOCK_RUNS,
+    BlockSimulation,
+    Case,
+    Scans,
+    TruthSpan,
+    spans,
+    square_root,
+    two_point_start,
+)
+from hybridtrack.statistics import (
+    Moments,
+    Names,
+    SumMoments,
+    accumulate_steps,
+    accumulate_window,
+    advantage_kept,
+    merge_moments,
+    merge_sum_moments,
+    score,
+    score_measurements,
+    sum_moments,
+)
+
+SPAN_STEPS = 32  # steps between two looks at Python: their arrays stay in the cache
+LANE_GROUP = 32  # lanes are filtered in whole groups, so that each takes the same instructions
+
+RAW = "raw"
+TRUTH = "truth"
+
+Series = tuple[str, str]  # estimator, quantity
+Cell = tuple[str, str, str]  # estimator, window, quantity
+
+
+class BlockTask(NamedTuple):
+    """A block of runs of one case."""
+
+    case: int
+    block: int
+    runs: int  # how many of the block's runs are wanted
+    tracks: int  # how many of them are kept whole
+
+
+class Track(NamedTuple):
+    """One quantity of one run over the steps."""
+
+    run: int
+    estimator: str
+    quantity: str
+    values: Array  # (n_steps,)
+
+
+class BlockResult(NamedTuple):
+    """Statistics of a block."""
+
+    task: BlockTask
+    steps: dict[Series, Moments]  # arrays (n_steps,)
+    sums: dict[Cell, tuple[Array, Array]]  # (runs,) sums over steps, and their numbers
+    status: dict[str, NDArray[np.int64]]  # by estimator (runs,): 0, or the step of divergence
+    tracks: list[Track]
+
+
+class GroupStatistics(NamedTuple):
+    """Statistics of several blocks of one case, merged in their order."""
+
+    steps: dict[Series, Moments]
+    windows: dict[Cell, SumMoments]
+    diverged: dict[str, int]
+
+
+def run_block(experiment: Experiment, task: BlockTask, stop: threading.Event) -> BlockResult:
+    """Simulate, estimate and score one block. Raises Stopped soon after `stop` is set."""
+    return _Block(experiment, task).run(stop)
+
+
+def merge(a: GroupStatistics, b: GroupStatistics) -> GroupStatistics:
+    """Two groups together; `a` comes first in the order of blocks."""
+    return GroupStatistics(
+        {key: merge_moments(a.steps[key], b.steps[key]) for key in a.steps},
+        {key: merge_sum_moments(a.windows[key], b.windows[key]) for key in a.windows},
+        {key: a.diverged[key] + b.diverged[key] for key in a.diverged},
+    )
+
+
+def summarise(result: BlockResult) -> GroupStatistics:
+    """A block as a group of its own."""
+    windows = {
+        cell: sum_moments(sums, numbers, result.status[cell[0]] == 0)
+        for cell, (sums, numbers) in result.sums.items()
+    }
+    diverged = {label: int((status > 0).sum()) for label, status in result.status.items()}
+    return GroupStatistics(result.steps, windows, diverged)
+
+
+def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) -> NDArray[np.bool_]:
+    """The steps of a span that a window holds: (n_steps, lanes or 1)."""
+    scan = first_scan + np.arange(len(times_s))
+    held = (times_s >= window.from_s) & (times_s <= window.until_s) & (scan >= window.skip_scans)
+    mask: NDArray[np.bool_] = np.repeat(held[:, np.newaxis], truth.mode.shape[1], axis=1)
+    if window.mode is not None:
+        mask &= truth.mode == window.mode
+    if window.after_switch_s is not None:
+        mask &= truth.since_switch_s > window.after_switch_s
+    if window.within_switch_s is not None:
+        mask &= truth.since_switch_s <= window.within_switch_s
+    return mask
+
+
+class _Block:
+    """The state of a block on its way through the spans."""
+
+    def __init__(self, experiment: Experiment, task: BlockTask) -> None:
+        self._experiment = experiment
+        self._task = task
+        self._case: Case = experiment.cases[task.case]
+        self._n_steps = len(self._case.times_s) - 1
+        self._lanes = LANE_GROUP * -(-task.runs // LANE_GROUP)
+        assert self._lanes <= BLOCK_RUNS
+        self._simulation = BlockSimulation(
+            self._case,
+            experiment.sensor,
+            experiment.seed,
+            task.case,
+            task.block,
+            self._lanes,
+        )
+        step_s = np.diff(self._case.times_s)
+        self._even = np.ptp(step_s) <= 1e-9 * step_s.mean()
+        self._even_step_s = step_s[:1]
+        self._running: dict[str, Running] = {}
+        self._steps: dict[Series, Moments] = {}
+        self._sums: dict[Cell, tuple[Array, Array]] = {}
+        self._status: dict[str, NDArray[np.int64]] = {RAW: np.zeros(task.runs, dtype=np.int64)}
+        self._tracks: dict[tuple[int, str, str], Array] = {}
+
+    def run(self, stop: threading.Event) -> BlockResult:
+        for span in spans(self._n_steps, SPAN_STEPS):
+            if stop.is_set():
+                raise Stopped
+            scans = self._simulation.advance(span)
+            if not self._running:
+                self._start(scans)
+            self._advance(span, scans)
+        tracks = [Track(*key, values) for key, values in self._tracks.items()]
+        return BlockResult(self._task, self._steps, self._sums, self._status, tracks)
+
+    # ---- the filters' start ----
+
+    def _start(self, scans: Scans) -> None:
+        experiment, initial = self._experiment, self._experiment.initial
+        states = experiment.bank.state_names
+        mean = np.repeat(initial.mean[:, np.newaxis], self._lanes, axis=1)
+        covariance = initial.covariance
+        self._first_step = 0
+        if initial.two_point:
+            z, times_s = scans.measurements, self._case.times_s
+            noise = experiment.bank.modes[0].measurement_noise_covariance
+            mean, covariance = two_point_start(
+                z[0], z[1], float(times_s[2] - times_s[1]), noise, states
+            )
+            self._first_step = 2
+        elif initial.follows_truth:
+            known = self._simulation.state_names
+            for e, name in enumerate(states):
+                mean[e] = self._simulation.initial_state[known.index(name)] if name in known else 0
+            if initial.drawn:
+                noise = self._simulation.initial_estimate_noise(len(states))
+                mean += square_root(covariance) @ noise
+        self._initial_covariance = covariance
+        self._even_model = self._model(self._even_step_s)
+        for label, estimator, settings in experiment.estimators:
+            self._running[label] = Running(estimator, settings, self._even_model, mean)
+            self._status[label] = np.zeros(self._task.runs, dtype=np.int64)
+
+    def _model(self, step_s: Array) -> JumpMarkovModel:
+        n_x = len(self._experiment.bank.state_names)
+        return self._experiment.bank.discretise(step_s, np.zeros(n_x), self._initial_covariance)
+
+    # ---- one span ----
+
+    def _advance(self, span: slice, scans: Scans) -> None:
+        experiment = self._experiment
+        times_s = self._case.times_s[span.start + 1 : span.stop + 1]
+        masks = {
+            window.name: inside(window, times_s, span.start, scans.truth)
+            for window in experiment.windows
+        }
+        known = self._simulation.state_names
+        self._score_truth(span, scans)
+        for quantity, values in score_measurements(scans, known).items():
+            self._take(span, RAW, quantity, values, masks)
+        model = self._even_model
+        skipped = max(self._first_step - span.start, 0)  # scans used up by a two-point start
+        if not self._even:
+            model = self._model(np.diff(self._case.times_s[span.start + skipped : span.stop + 1]))
+        advantages: dict[str, Array] = {}
+        for label, running in self._running.items():
+            estimates = running.advance(
+                model,
+                np.ascontiguousarray(scans.measurements[skipped:]),
+                covariance=self._task.tracks > 0,
+            )
+            estimates = _padded(estimates, skipped)
+            self._note_status(span, label, estimates)
+            names = Names(known, experiment.truth_modes, running.state_names, running.mode_names)
+            scores = score(scans, estimates, names)
+            for quantity, values in scores.quantities.items():
+                self._take(span, label, quantity, values, masks)
+            if scores.likelihood_advantage is not None:
+                advantages[label] = scores.likelihood_advantage
+            if len(running.mode_names) > 1:
+                for j, name in enumerate(running.mode_names):
+                    probabilities = estimates.mode_probabilities[:, j]
+                    self._take(span, label, f"mode_probability:{name}", probabilities)
+                    if estimates.mode_likelihoods.shape[0]:
+                        likelihoods = np.ascontiguousarray(estimates.mode_likelihoods[:, j])
+                        likelihoods[np.isnan(scans.measurements).any(axis=1)] = np.nan
+                        self._take(span, label, f"mode_likelihood:{name}", likelihoods)
+            self._keep_estimates(span, label, running, estimates)
+        reference = advantages.get(experiment.compare_with or "")
+        if reference is not None:
+            for label, advantage in advantages.items():
+                kept = advantage_kept(advantage, reference)
+                self._take(span, label, "likelihood_advantage_kept", kept, masks)
+
+    def _score_truth(self, span: slice, scans: Scans) -> None:
+        for j, name in enumerate(self._experiment.truth_modes):
+            share = np.repeat(
+                (scans.truth.mode == j).astype(np.float64),
+                self._lanes // scans.truth.mode.shape[1],
+                axis=1,
+            )
+            self._take(span, TRUTH, f"mode_probability:{name}", share)
+        if not self._task.tracks:
+            return
+        for e, name in enumerate(self._simulation.state_names):
+            self._keep(span, TRUTH, name, scans.truth.state[:, e])
+        if self._experiment.truth_modes:
+            self._keep(span, TRUTH, "mode", scans.truth.mode.astype(np.float64))
+        for m in range(scans.measurements.shape[1]):
+            self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
+
+    def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
+        runs = self._task.runs
+        bad = ~np.isfinite(estimates.mean[-1, :, :runs]).all(axis=0) & (self._status[label] == 0)
+        if len(estimates.mean) <= self._first_step - span.start:
+            return
+        for b in np.flatnonzero(bad):
+            finite = np.isfinite(estimates.mean[:, :, b]).all(axis=1)
+            begin = max(self._first_step - span.start, 0)
+            self._status[label][b] = span.start + begin + int(np.argmin(finite[begin:])) + 1
+
+    def _take(
+        self,
+        span: slice,
+        label: str,
+        quantity: str,
+        values: Array,
+        masks: dict[str, NDArray[np.bool_]] | None = None,
+    ) -> None:
+        """Add a span of a quantity (n_steps, lanes) to the statistics."""
+        runs = self._task.runs
+        key = (label, quantity)
+        if key not in self._steps:
+            self._steps[key] = Moments(*(np.zeros(self._n_steps) for _ in range(3)))
+        here = [array[span] for array in self._steps[key]]
+        accumulate_steps(values, runs, *here)
+        for window, mask in (masks or {}).items():
+            cell = (label, window, quantity)
+            if cell not in self._sums:
+                self._sums[cell] = (np.zeros(runs), np.zeros(runs))
+            accumulate_window(values, mask, runs, *self._sums[cell])
+
+    # ---- tracks of the first runs ----
+
+    def _keep_estimates(
+        self, span: slice, label: str, running: Running, estimates: Estimates
+    ) -> None:
+        if not self._task.tracks:
+            return
+        for e, name in enumerate(running.state_names):
+            self._keep(span, label, name, estimates.mean[:, e])
+            variance = estimates.covariance[:, e * (e + 1) // 2 + e]
+            self._keep(span, label, f"std:{name}", np.sqrt(np.maximum(variance, 0.0)))
+        if len(running.mode_names) > 1:
+            for j, name in enumerate(running.mode_names):
+                values = estimates.mode_probabilities[:, j]
+                self._keep(span, label, f"mode_probability:{name}", values)
+
+    def _keep(self, span: slice, label: str, quantity: str, values: Array) -> None:
+        for run in range(self._task.tracks):
+            key = (run, label, quantity)
+            if key not in self._tracks:
+                self._tracks[key] = np.full(self._n_steps, np.nan)
+            self._tracks[key][span] = values[:, run if values.shape[1] > 1 else 0]
+
+
+def _padded(estimates: Estimates, skipped: int) -> Estimates:
+    """NaN in front, for scans that have no estimate yet."""
+    if not skipped:
+        return estimates
+    padded = []
+    for array in estimates:
+        front = np.full((skipped if len(array) else 0, *array.shape[1:]), np.nan)
+        padded.append(np.concatenate([front, array]))
+    return Estimates(*padded)

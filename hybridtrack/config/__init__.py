@@ -1,0 +1,58 @@
+"""From a YAML file to a frozen Experiment: the only room that knows yaml, pydantic and units."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hybridtrack.compiled import PACKAGE
+from hybridtrack.config.build import ChosenEstimator, Experiment, Initial, Window, build
+from hybridtrack.config.reader import Document, ScenarioError, dump, read
+from hybridtrack.config.schema import json_schema
+from hybridtrack.config.validate import validate
+
+__all__ = [
+    "ChosenEstimator",
+    "Document",
+    "Experiment",
+    "Initial",
+    "ScenarioError",
+    "Window",
+    "dump",
+    "find",
+    "json_schema",
+    "load",
+    "shipped",
+]
+
+
+def shipped() -> dict[str, Path]:
+    """The scenarios that come with the package, by name."""
+    for folder in (PACKAGE / "configs", PACKAGE.parent / "configs"):
+        if folder.is_dir():
+            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {}
+
+
+def find(config: str) -> Path:
+    """The file of a scenario given by its path, or by the name of a shipped one."""
+    path = Path(config)
+    if path.exists() or config not in shipped():
+        if not path.exists() and not path.suffix and path.name == config:
+            names = ", ".join(shipped())
+            raise ScenarioError(
+                f"{config}: there is no such file, and no scenario of that name is shipped; "
+                f"there are {names}"
+            )
+        return path
+    return shipped()[config]
+
+
+def load(config: str | Path, settings: Sequence[str] = ()) -> Experiment:
+    """The experiment of a scenario, after `key.path=value` settings.
+
+    Raises ScenarioError: one sentence with file, line, column, key, value and remedy.
+    """
+    path = find(str(config))
+    document = read(path)
+    for setting in settings:
+        document = document.with_setting(setting)
+    return build(validate(document), document, path.parent)

@@ -1,0 +1,459 @@
+"""An experiment from its blocks to its run folder: shards, merging, tables, verdicts."""
+
+import hashlib
+import json
+import math
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from hybridtrack import __version__, results
+from hybridtrack.blocks import (
+    RAW,
+    BlockResult,
+    BlockTask,
+    GroupStatistics,
+    Track,
+    merge,
+    run_block,
+    summarise,
+)
+from hybridtrack.compiled import PACKAGE, source_digest
+from hybridtrack.config import Experiment, dump
+from hybridtrack.executors import in_order
+from hybridtrack.results import RunFolder
+from hybridtrack.simulation import BLOCK_RUNS
+from hybridtrack.statistics import (
+    METRICS,
+    QUANTITIES,
+    Estimate,
+    Metric,
+    Moments,
+    Paired,
+    RunSums,
+    SumMoments,
+    compare,
+    ratio_of_sums,
+)
+from hybridtrack.verdicts import Claim, Outcome, judge_comparison, judge_figure
+
+SHARD_BLOCKS = 8  # blocks whose statistics are put away together
+
+Report = Callable[[int, int], None]  # runs done, runs in all
+
+
+class Shard(NamedTuple):
+    """Some blocks of one case, in order."""
+
+    name: str  # says how many runs it holds, so that a longer study doesn't take it for its own
+    tasks: tuple[BlockTask, ...]
+
+    @property
+    def runs(self) -> int:
+        """Runs in all its blocks."""
+        return sum(task.runs for task in self.tasks)
+
+
+def digest(experiment: Experiment) -> str:
+    """What a run folder is named by: the scenario without `runs`, its recordings, our sources."""
+    resolved = json.loads(json.dumps(experiment.resolved))
+    del resolved["monte_carlo"]["runs"]
+    hashed = hashlib.sha256(json.dumps(resolved, sort_keys=True).encode())
+    hashed.update(source_digest().encode())
+    if "recording" in resolved["truth"]:
+        for case in experiment.cases:
+            for array in (case.times_s, *case.truth[:1], case.recorded):
+                if isinstance(array, np.ndarray):
+                    hashed.update(array.tobytes())
+    return hashed.hexdigest()[:10]
+
+
+def default_folder(experiment: Experiment, root: Path = Path("runs")) -> Path:
+    """Where a run goes that isn't told otherwise."""
+    return root / f"{experiment.name}-{digest(experiment)}"
+
+
+def is_complete(path: Path, experiment: Experiment) -> bool:
+    """Whether a folder holds this experiment, finished, with as many runs or more."""
+    manifest = results.read_manifest(path)
+    return (
+        manifest is not None
+        and manifest.get("status") == results.COMPLETE
+        and manifest.get("digest") == digest(experiment)
+        and manifest.get("runs", 0) >= experiment.runs
+    )
+
+
+def run(experiment: Experiment, path: Path, workers: int, report: Report) -> None:
+    """Run an experiment into its folder, going on from whatever shards are there.
+
+    Nothing already written is lost on the way: the tables of a shorter run stay until those of
+    this one replace them.
+    """
+    shards = plan(experiment)
+    with RunFolder(path, digest(experiment)) as folder:
+        before = results.read_manifest(path) or {}
+        manifest = _manifest(experiment, before)
+        folder.write_manifest(manifest)
+        results.write_text(path / "config.yaml", dump(experiment.resolved))
+        cases: dict[int, GroupStatistics] = {}
+        tracks: list[tuple[int, Track]] = []
+        for shard, group, kept in _shard_statistics(experiment, folder, shards, workers, report):
+            case = shard.tasks[0].case
+            cases[case] = merge(cases[case], group) if case in cases else group
+            tracks += [(case, track) for track in kept]
+        names = [shard.name for shard in shards]
+        n_cells = len(labels(experiment)) * len(experiment.windows)
+        folder.assemble_runs(names, n_cells)
+        manifest["shards"] = names
+        folder.write_manifest(manifest)
+        folder.drop_parts(names)
+        merged = [cases[c] for c in range(len(experiment.cases))]
+        folder.write_table("steps", _steps_table(experiment, merged))
+        folder.write_table("tracks", _tracks_table(experiment, tracks))
+        folder.write_table("summary", _summary_table(experiment, merged))
+        folder.write_table("comparisons", _comparisons_table(experiment, path))
+        folder.write_table("published", _published_table(experiment, path, merged))
+        manifest |= {
+            "status": results.COMPLETE,
+            "finished": _now(),
+            "diverged": {
+                label: count
+                for label in merged[0].diverged
+                if (count := sum(group.diverged[label] for group in merged))
+            },
+        }
+        folder.write_manifest(manifest)
+
+
+def plan(experiment: Experiment) -> list[Shard]:
+    """The shards of an experiment, in the order in which they are merged."""
+    shards = []
+    blocks = -(-experiment.runs // BLOCK_RUNS)
+    for case in range(len(experiment.cases)):
+        for first in range(0, blocks, SHARD_BLOCKS):
+            tasks = tuple(
+                BlockTask(
+                    case,
+                    block,
+                    min(BLOCK_RUNS, experiment.runs - block * BLOCK_RUNS),
+                    experiment.keep_tracks if block == 0 else 0,
+                )
+                for block in range(first, min(first + SHARD_BLOCKS, blocks))
+            )
+            runs = sum(task.runs for task in tasks)
+            shards.append(Shard(f"{case:04d}-{first // SHARD_BLOCKS:06d}-{runs}", tasks))
+    return shards
+
+
+def _shard_statistics(
+    experiment: Experiment,
+    folder: RunFolder,
+    shards: list[Shard],
+    workers: int,
+    report: Report,
+) -> Iterator[tuple[Shard, GroupStatistics, list[Track]]]:
+    """Each shard's statistics in order, from disk or by running its blocks."""
+    at_hand = {shard.name for shard in shards if folder.has_shard(shard.name)}
+    tasks = [task for shard in shards if shard.name not in at_hand for task in shard.tasks]
+    total = sum(shard.runs for shard in shards)
+    done = 0
+    block_results = in_order(lambda task, stop: run_block(experiment, task, stop), tasks, workers)
+    try:
+        for shard in shards:
+            if shard.name in at_hand:
+                group, tracks = _unpack(folder.load_shard(shard.name))
+                done += shard.runs
+                report(done, total)
+            else:
+                blocks = []
+                for _ in shard.tasks:
+                    blocks.append(next(block_results))
+                    done += blocks[-1].task.runs
+                    report(done, total)
+                group = summarise(blocks[0])
+                for block in blocks[1:]:
+                    group = merge(group, summarise(block))
+                tracks = [track for block in blocks for track in block.tracks]
+                cells = _run_cells(experiment, blocks)
+                folder.save_shard(shard.name, _pack(group, tracks), cells)
+            yield shard, group, tracks
+    finally:
+        block_results.close()  # type: ignore[attr-defined]  # stops the threads
+
+
+# ---- shards on disk --------------------------------------------------------------------------
+
+
+def _pack(group: GroupStatistics, tracks: list[Track]) -> dict[str, Any]:
+    keys = {
+        "steps": [list(key) for key in group.steps],
+        "windows": [list(key) for key in group.windows],
+        "diverged": group.diverged,
+        "tracks": [[t.run, t.estimator, t.quantity] for t in tracks],
+    }
+    return {
+        "keys": np.array(json.dumps(keys)),
+        "steps": np.array([list(moments) for moments in group.steps.values()]),
+        "windows": np.array([list(moments) for moments in group.windows.values()], dtype=float),
+        "tracks": np.array([track.values for track in tracks]),
+    }
+
+
+def _unpack(arrays: dict[str, Any]) -> tuple[GroupStatistics, list[Track]]:
+    keys = json.loads(str(arrays["keys"]))
+    steps = {(k[0], k[1]): Moments(*a) for k, a in zip(keys["steps"], arrays["steps"], strict=True)}
+    windows = {
+        (k[0], k[1], k[2]): SumMoments(*a)
+        for k, a in zip(keys["windows"], arrays["windows"], strict=True)
+    }
+    tracks = [Track(*k, a) for k, a in zip(keys["tracks"], arrays["tracks"], strict=True)]
+    return GroupStatistics(steps, windows, keys["diverged"]), tracks
+
+
+def _run_cells(experiment: Experiment, blocks: list[BlockResult]) -> list[pa.Table]:
+    """Rows of runs.parquet by estimator and window: one per run, with sums and counts."""
+    name = experiment.cases[blocks[0].task.case].name
+    case = blocks[0].task.case
+    numbers = [b.task.block * BLOCK_RUNS + np.arange(b.task.runs) for b in blocks]
+    run = np.concatenate(numbers)
+    cells = []
+    for label in labels(experiment):
+        status = np.concatenate([block.status[label] for block in blocks])
+        for window in experiment.windows:
+            columns: dict[str, Any] = {
+                "case": pa.array([name] * run.size),
+                "case_number": np.full(run.size, case),
+                "run": run,
+                "estimator": pa.array([label] * run.size),
+                "window": pa.array([window.name] * run.size),
+                "status": status,
+            }
+            for quantity in QUANTITIES:
+                key = (label, window.name, quantity)
+                sums = [
+                    block.sums.get(key, (np.full(n.size, np.nan), np.zeros(n.size)))
+                    for block, n in zip(blocks, numbers, strict=True)
+                ]
+                columns[f"{quantity}_sum"] = np.concatenate([s[0] for s in sums])
+                counts = np.concatenate([s[1] for s in sums])
+                columns[f"{quantity}_count"] = counts.astype(np.int64)
+            cells.append(pa.table(columns))
+    return cells
+
+
+# ---- tables ----------------------------------------------------------------------------------
+
+
+def _step_metrics(quantity: str) -> list[tuple[str, bool]]:
+    """Metrics of a quantity as steps.parquet has them: name, and whether a root is taken."""
+    found = [(name, m.root) for name, m in METRICS.items() if m.quantity == quantity]
+    return found or [(quantity, False)]
+
+
+def _steps_table(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
+    parts: list[dict[str, Any]] = []
+    for case, group in zip(experiment.cases, cases, strict=True):
+        times_s = case.times_s[1:]
+        for (label, quantity), moments in group.steps.items():
+            n = moments.count
+            with np.errstate(invalid="ignore", divide="ignore"):
+                mean = np.where(n > 0, moments.mean, np.nan)
+                error = np.sqrt(moments.squares / (n * (n - 1)))
+                error[n < 2] = np.nan
+                for metric, root in _step_metrics(quantity):
+                    value = np.sqrt(mean) if root else mean
+                    scale = np.where(value > 0, 0.5 / value, 0.0) if root else 1.0
+                    parts.append(
+                        {
+                            "case": np.full(n.size, case.name),
+                            "estimator": np.full(n.size, label),
+                            "step": np.arange(1, n.size + 1, dtype=np.int32),
+                            "time_s": times_s,
+                            "metric": np.full(n.size, metric),
+                            "value": value,
+                            "standard_error": error * scale,
+                        }
+                    )
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _tracks_table(experiment: Experiment, tracks: list[tuple[int, Track]]) -> dict[str, Any]:
+    parts = []
+    for case, track in tracks:
+        n = track.values.size
+        parts.append(
+            {
+                "case": np.full(n, experiment.cases[case].name),
+                "run": np.full(n, track.run),
+                "estimator": np.full(n, track.estimator),
+                "step": np.arange(1, n + 1, dtype=np.int32),
+                "time_s": experiment.cases[case].times_s[1:],
+                "quantity": np.full(n, track.quantity),
+                "value": track.values,
+            }
+        )
+    names = results.SCHEMAS["tracks"].names
+    if not parts:
+        return {name: [] for name in names}
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
+def labels(experiment: Experiment) -> tuple[str, ...]:
+    """Rows of the tables: the raw measurements, then the estimators in the scenario's order."""
+    return (RAW, *(chosen.label for chosen in experiment.estimators))
+
+
+def _pooled(cases: list[GroupStatistics], label: str, window: str, metric: Metric) -> Estimate:
+    cells = [group.windows.get((label, window, metric.quantity)) for group in cases]
+    present = [tuple(float(v) for v in cell) for cell in cells if cell is not None]
+    return ratio_of_sums(present, metric.root)
+
+
+def _summary_table(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
+    rows: list[tuple[Any, ...]] = []
+    for label in labels(experiment):
+        for window in experiment.windows:
+            for name, metric in METRICS.items():
+                estimate = _pooled(cases, label, window.name, metric)
+                if not math.isnan(estimate.value):
+                    rows.append((label, name, window.name, *estimate))
+    return _columns("summary", rows)
+
+
+def _columns(table: str, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
+    names = results.SCHEMAS[table].names
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def _runs(path: Path, label: str, window: str) -> dict[str, RunSums]:
+    """The runs of an estimator in a window, by quantity."""
+    sums, case, status = results.read_run_sums(path, label, window)
+    return {q: RunSums(case, s, n, status == 0) for q, (s, n) in sums.items()}
+
+
+def paired(path: Path, first: str, second: str, metric: str, window: str) -> Paired:
+    """Two estimators of a run folder compared over the same runs."""
+    quantity, root = METRICS[metric].quantity, METRICS[metric].root
+    return compare(
+        _runs(path, first, window)[quantity], _runs(path, second, window)[quantity], root
+    )
+
+
+def _comparisons_table(experiment: Experiment, path: Path) -> dict[str, Any]:
+    """Every estimator against `compare_with`, window by window, metric by metric."""
+    rows: list[tuple[Any, ...]] = []
+    second = experiment.compare_with
+    for window in experiment.windows if second is not None else ():
+        assert second is not None
+        other = _runs(path, second, window.name)
+        for first in labels(experiment):
+            one = _runs(path, first, window.name) if first != second else {}
+            for name, metric in METRICS.items() if one else ():
+                pair = compare(one[metric.quantity], other[metric.quantity], metric.root)
+                n = pair.difference.n_runs
+                if n:
+                    figures = (*pair.difference[:2], *pair.ratio[:2], n)
+                    rows.append((first, second, name, window.name, *figures))
+    return _columns("comparisons", rows)
+
+
+def _published_table(
+    experiment: Experiment, path: Path, cases: list[GroupStatistics]
+) -> dict[str, Any]:
+    rows = []
+    for claim in experiment.claims:
+        outcome = _judge(experiment, path, cases, claim)
+        ours = outcome.ours
+        rows.append(
+            (
+                claim.claim,
+                " / ".join(claim.compare) if claim.compare else claim.estimator,
+                claim.metric,
+                claim.window,
+                claim.value,
+                ours.value,
+                ours.standard_error,
+                outcome.verdict,
+                claim.expect,
+                outcome.differs,
+                claim.because,
+            )
+        )
+    return _columns("published", rows)
+
+
+def _judge(
+    experiment: Experiment, path: Path, cases: list[GroupStatistics], claim: Claim
+) -> Outcome:
+    assumed = bool(experiment.assumptions)
+    if claim.compare is not None:
+        pair = paired(path, *claim.compare, claim.metric, claim.window)
+        return judge_comparison(claim, pair, assumed)
+    assert claim.estimator is not None
+    ours = _pooled(cases, claim.estimator, claim.window, METRICS[claim.metric])
+    return judge_figure(claim, ours, assumed)
+
+
+# ---- what made it ----------------------------------------------------------------------------
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _manifest(experiment: Experiment, before: dict[str, Any]) -> dict[str, Any]:
+    packages = ("numpy", "scipy", "numba", "pyarrow", "pandas")
+    return {
+        "status": results.RUNNING,
+        "name": experiment.name,
+        "title": experiment.title,
+        "seed": experiment.seed,
+        "runs": experiment.runs,
+        "digest": digest(experiment),
+        "estimators": [chosen.label for chosen in experiment.estimators],
+        "modes": list(experiment.bank.names),
+        "windows": [window.name for window in experiment.windows],
+        "compare_with": experiment.compare_with,
+        "cases": len(experiment.cases),
+        "versions": {
+            "hybridtrack": __version__,
+            "sources": source_digest(),
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in packages},
+        },
+        "git": _git(),
+        "host": {"system": platform.platform(), "machine": platform.machine()},
+        "command": sys.argv[1:],
+        "started": _now(),
+        "shards": before.get("shards", []),
+    }
+
+
+def _git() -> dict[str, Any] | None:
+    """Commit of the checkout that the package runs from; None where it is none."""
+    root = PACKAGE.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        commit, status = (
+            subprocess.run(
+                ["git", "-C", str(root), *command],
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=True,
+            ).stdout.strip()
+            for command in (["rev-parse", "HEAD"], ["status", "--porcelain"])
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return {"commit": commit, "dirty": bool(status)}

@@ -1,0 +1,509 @@
+"""Tables in, matplotlib Figures out: trajectory, errors and mode probabilities over time.
+
+Only matplotlib's object API on the Agg canvas is used and every setting lives in a context, so
+drawing needs no display, changes no global state, and gives the same bytes for the same tables.
+"""
+
+import math
+import os
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib.style
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Dashes = str | tuple[float, tuple[float, ...]]
+
+DPI = 200
+WIDTH_IN = 7.0  # two columns of a journal page
+HALVES = np.array([-0.5, 0.5])
+MOST_CASES = 6
+GAP_IN_MEDIAN_STEPS = 5.0
+LOG_SCALE_RATIO = 15.0
+LEAVES_THE_FRAME = 1e5  # a curve this many times the best one's median has nothing left to tell
+
+# Okabe & Ito (2008) without black (the truth) and yellow (faint on white); the last two, wine and
+# olive, are from Tol's muted scheme (2021). The dashes tell the curves apart in grey.
+COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255", "#999933"]
+DASHES: tuple[Dashes, ...] = (
+    "-",
+    (0, (5, 1.5)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (1.2, 1.2)),
+    (0, (9, 2)),
+    (0, (5, 1.5, 1, 1.5, 1, 1.5)),
+    (0, (2.5, 1)),
+    (0, (9, 2, 2.5, 2)),
+)
+RAW_COLOUR, TRUTH_COLOUR, TRUE_MODE_COLOUR, SWITCH_COLOUR = "0.55", "black", "0.88", "0.6"
+
+STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "figure.titlesize": 9.5,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.useoffset": False,
+    "agg.path.chunksize": 10_000,  # Agg gives up on a dashed line of a million points in one piece
+}
+
+
+class RunInformation(NamedTuple):
+    """What a figure says besides its curves; estimators and modes in the scenario's order."""
+
+    title: str
+    runs: int
+    estimators: tuple[str, ...]
+    modes: tuple[str, ...]
+
+
+class Look(NamedTuple):
+    """How one estimator is drawn, in every figure."""
+
+    label: str
+    colour: str
+    dashes: Dashes
+
+
+Looks = Mapping[str, Look]
+
+
+class Curve(NamedTuple):
+    """One metric of one estimator over time, each (n_steps,); time in s, NaN where unknown."""
+
+    time: Array
+    value: Array
+    standard_error: Array
+
+
+class Truth(NamedTuple):
+    """Share of the runs whose true mode is each mode, (n_steps, n_modes).
+
+    Mode k drives the step from k-1 to k, so step k lasts from edges[k-1] to edges[k], with
+    `edges` (n_steps + 1,) in s. The truth is `fixed` if it is the same in all runs.
+    """
+
+    edges: Array
+    modes: tuple[str, ...]
+    share: Array
+    fixed: bool
+
+
+class Case(NamedTuple):
+    """One case's rows of the steps' table, its true modes if known, and how its figures say it."""
+
+    steps: pd.DataFrame
+    truth: Truth | None
+    suffix: str
+    title: str
+
+
+def draw(
+    steps: pd.DataFrame, tracks: pd.DataFrame, information: RunInformation
+) -> dict[str, Figure]:
+    """Draw what the tables of a run folder hold; a figure whose data are absent is left out.
+
+    Args:
+        steps: long, columns case, estimator, step, time_s, metric, value, standard_error.
+        tracks: long, columns case, run, estimator, step, time_s, quantity, value (SI units).
+        information: title, number of runs, and the order of estimators and modes.
+
+    Returns:
+        Figures by name: trajectory (of the first run in `tracks`), position_error,
+        velocity_error, mode_probability and mode_likelihood. With several cases the figures over
+        time are drawn for each of the first six, and their names end in `-CASE`.
+    """
+    with _style():
+        looks = _looks(steps, tracks, information)
+        figures = {"trajectory": _draw_trajectory(tracks, looks, information)}
+        for case in _cases(steps, information.title):
+            for quantity, unit in (("position", "m"), ("velocity", "m/s")):
+                figure = _draw_error(case, quantity, unit, looks, information.runs)
+                figures[f"{quantity}_error{case.suffix}"] = figure
+            for metric in ("mode_probability", "mode_likelihood"):
+                figures[metric + case.suffix] = _draw_modes(case, metric, looks, information)
+    return {name: figure for name, figure in figures.items() if figure is not None}
+
+
+def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
+    """Write each figure to `folder`/NAME.png, whole or not at all; the folder is made if missing.
+
+    The same tables give the same bytes: the PNG carries neither date nor software.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, figure in figures.items():
+        path, partial = folder / f"{name}.png", folder / f".{name}.{os.getpid()}.partial"
+        try:
+            with _style():
+                figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+        paths.append(path)
+    return paths
+
+
+@contextmanager
+def _style() -> Iterator[None]:
+    """Matplotlib's defaults with our sizes, whatever the user's matplotlibrc says."""
+    with matplotlib.style.context(["default", STYLE]):
+        yield
+
+
+# ---- from tables to curves ----
+
+
+def _cases(steps: pd.DataFrame, title: str) -> list[Case]:
+    names = list(dict.fromkeys(steps["case"]))
+    chosen: dict[str, Case] = {}
+    for number, name in enumerate(names[:MOST_CASES], start=1):
+        table = steps[steps["case"] == name]
+        suffix, where = "", ""
+        if len(names) > 1:
+            suffix = "-" + re.sub(r"[^A-Za-z0-9_-]", "_", name)
+            suffix += f"-{number}" if suffix in chosen else ""
+            where = f", case {name} ({number} of {len(names)})"
+        chosen[suffix] = Case(table, _truth(table), suffix, title + where)
+    return list(chosen.values())
+
+
+def _looks(
+    steps: pd.DataFrame, tracks: pd.DataFrame, information: RunInformation
+) -> dict[str, Look]:
+    """Colour and dashes by the scenario's order of estimators; the raw measurements come first."""
+    names = dict.fromkeys([*information.estimators, *steps["estimator"], *tracks["estimator"]])
+    estimators = [name for name in names if name not in ("raw", "truth", "measurement")]
+    n = len(COLOURS)
+    return {"raw": Look("measurements", RAW_COLOUR, (0, (1, 1)))} | {
+        name: Look(_plain(name, 60), COLOURS[i % n], DASHES[(i + i // n) % n])
+        for i, name in enumerate(estimators)
+    }
+
+
+def _numbers(values: Any) -> Array:
+    """As float64, NaN for what isn't finite: an infinity cannot be drawn."""
+    numbers = np.asarray(values, dtype=np.float64)
+    return np.where(np.isfinite(numbers), numbers, np.nan)
+
+
+def _curves(table: pd.DataFrame, metric: str, looks: Looks) -> dict[str, Curve]:
+    """The curves of one case and metric by estimator, in the order of `looks`."""
+    chosen = table[table["metric"] == metric].sort_values("step", kind="stable")
+    curves = {}
+    for name in looks:
+        rows = chosen[chosen["estimator"] == name]
+        curve = Curve(*(_numbers(rows[c]) for c in ("time_s", "value", "standard_error")))
+        if np.isfinite(curve.value).any():
+            curves[name] = curve
+    return curves
+
+
+def _modes(table: pd.DataFrame, metric: str) -> tuple[str, ...]:
+    metrics = dict.fromkeys(table["metric"])
+    return tuple(m.removeprefix(f"{metric}:") for m in metrics if m.startswith(f"{metric}:"))
+
+
+def _truth(table: pd.DataFrame) -> Truth | None:
+    """The truth's modes in one case, None if the table doesn't know them."""
+    rows = table[table["estimator"] == "truth"]
+    modes = _modes(rows, "mode_probability")
+    wide = rows.pivot(index=["step", "time_s"], columns="metric", values="value").sort_index()
+    share = _numbers(wide[[f"mode_probability:{mode}" for mode in modes]])
+    if not np.isfinite(share).any():
+        return None
+    time = _numbers(wide.index.get_level_values("time_s"))
+    first = 2 * time[0] - time[1] if len(time) > 1 else time[0]  # k = 0 has no row of its own
+    fixed = bool(np.isin(share[np.isfinite(share)], (0.0, 1.0)).all())
+    return Truth(np.concatenate([[first], time]), modes, share, fixed)
+
+
+def _switches(truth: Truth | None) -> Array:
+    """Times (s) at which a fixed truth switches its mode; none for a random truth."""
+    if truth is None or not truth.fixed:
+        return np.empty(0)
+    change = np.abs(np.diff(truth.share, axis=0)).max(axis=1)  # NaN beside an unknown mode
+    switches: Array = truth.edges[1:-1][change > 0]
+    return switches
+
+
+def _broken_at_gaps(time: Array, *columns: Array) -> list[Array]:
+    """The same columns with a NaN put in wherever the time jumps: no line crosses a gap."""
+    if len(time) < 2:
+        return [time, *columns]
+    jumps = np.diff(time)
+    gaps = np.flatnonzero(jumps > GAP_IN_MEDIAN_STEPS * np.median(jumps)) + 1
+    return [np.insert(column, gaps, np.nan) for column in (time, *columns)]
+
+
+# ---- the trajectory ----
+
+
+def _draw_trajectory(
+    tracks: pd.DataFrame, looks: Looks, information: RunInformation
+) -> Figure | None:
+    """One run in the plane (east, north), or its position over time if it has one dimension."""
+    if tracks.empty:
+        return None
+    case, run = tracks["case"].iloc[0], tracks["run"].iloc[0]
+    one = tracks[(tracks["case"] == case) & (tracks["run"] == run)]
+    plane = bool(one.loc[one["quantity"] == "y", "value"].notna().any())
+    paths = _paths(one, plane)
+    if not paths:
+        return None
+    figure, (ax,) = _panels(1, 1, 3.2)
+    _plot_paths(ax, paths, looks)
+    leaving = _frame_trajectory(figure, ax, paths, plane)
+    where = f"case {case}, " if tracks["case"].nunique() > 1 else ""
+    _finish(figure, information.title, f"Trajectory, {where}run {run}", leaving)
+    return figure
+
+
+def _paths(one: pd.DataFrame, plane: bool) -> dict[str, Array]:
+    """(x, y), or (time, x) without a plane, (2, n_steps), of everything that has a position."""
+    paths = {}
+    for name in dict.fromkeys(one["estimator"]):
+        rows = one[(one["estimator"] == name) & one["quantity"].isin(["x", "y"])]
+        wide = rows.pivot(index=["step", "time_s"], columns="quantity", values="value").sort_index()
+        wide = wide.reindex(columns=["x", "y"])
+        time = _numbers(wide.index.get_level_values("time_s"))
+        x, y = _numbers(wide["x"]), _numbers(wide["y"])
+        path = np.array(_broken_at_gaps(time, *((x, y) if plane else (time, x)))[1:])
+        if np.isfinite(path).all(axis=0).any():
+            paths[name] = path
+    return paths
+
+
+def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> None:
+    if "measurement" in paths:
+        label, colour, _ = looks["raw"]
+        ax.plot(
+            *paths["measurement"], ".", color=colour, markersize=3.5, markeredgewidth=0, label=label
+        )
+    if "truth" in paths:
+        truth = paths["truth"]
+        start = truth[:, np.isfinite(truth).all(axis=0)][:, 0]
+        ax.plot(*truth, color=TRUTH_COLOUR, linewidth=2.2, label="truth")
+        ax.plot(*start, "o", color=TRUTH_COLOUR, markerfacecolor="white", zorder=5, label="start")
+    for name, look in looks.items():
+        if name in paths:
+            _plot_line(ax, paths[name][0], paths[name][1], look)
+
+
+def _frame_trajectory(
+    figure: Figure, ax: Axes, paths: Mapping[str, Array], plane: bool
+) -> list[str]:
+    """Fit axes and unit to the flight and the estimates; returns the estimates that leave.
+
+    An estimate may widen the frame by half a span of the flight on each side and no more, so that
+    a filter that runs away doesn't shrink the flight to a dot.
+    """
+    flight = [paths[name] for name in ("truth", "measurement") if name in paths]
+    flown, everything = _extent(flight or paths.values()), _extent(paths.values())
+    span = np.ptp(flown, axis=1)
+    margin = 0.5 * (np.full(2, span.max()) if plane else span)
+    margin[margin == 0] = np.inf
+    low = np.maximum(everything[:, 0], flown[:, 0] - margin)
+    high = np.minimum(everything[:, 1], flown[:, 1] + margin)
+    size = 1.08 * np.where(high > low, high - low, 1.0)
+    unit, metres = ("km", 1e3) if size[0 if plane else 1 :].max() > 10e3 else ("m", 1.0)
+    formatter = _plain_numbers(metres)
+    ax.yaxis.set_major_formatter(formatter)
+    ax.set_ylabel(f"y, north ({unit})" if plane else f"position x ({unit})")
+    ax.set_xlabel(f"x, east ({unit})" if plane else "time (s)")
+    if plane:
+        # Even a straight flight gets a readable shape.
+        size = np.maximum(size, [1.3 * size[1], 0.3 * size[0]])
+        figure.set_figheight(0.5 + 6.3 * size[1] / size[0])
+        ax.xaxis.set_major_formatter(formatter)
+        ax.set_aspect("equal")
+    middle = (low + high) / 2
+    ax.set(xlim=middle[0] + size[0] * HALVES, ylim=middle[1] + size[1] * HALVES)
+    return [
+        name
+        for name, path in paths.items()
+        if (np.abs(path - middle[:, None]) > size[:, None] / 2).any()
+    ]
+
+
+def _extent(paths: Iterable[Array]) -> Array:
+    """(2, 2): the least and the largest of both rows."""
+    joined = np.concatenate(list(paths), axis=1)
+    return np.stack([np.nanmin(joined, axis=1), np.nanmax(joined, axis=1)], axis=1)
+
+
+# ---- figures over time ----
+
+
+def _draw_error(case: Case, quantity: str, unit: str, looks: Looks, runs: int) -> Figure | None:
+    curves = _curves(case.steps, f"{quantity}_rmse_{unit.replace('/', '_')}", looks)
+    if not curves:
+        return None
+    figure, (ax,) = _panels(1, 1, 3.0)
+    for name, curve in curves.items():
+        _plot_curve(ax, curve, looks[name])
+    _mark_switches(ax, _switches(case.truth))
+    leaving = _scale_error(ax, {name: curve.value for name, curve in curves.items()})
+    _frame_time([ax], curves.values(), case.truth)
+    ax.set_ylabel(f"{quantity} RMS error ({unit})")
+    _finish(figure, case.title, f"RMS {_over(curves.values(), runs)}", leaving)
+    return figure
+
+
+def _draw_modes(
+    case: Case, metric: str, looks: Looks, information: RunInformation
+) -> Figure | None:
+    """One panel per mode on shared axes, so that a panel compares the estimators."""
+    modes = dict.fromkeys([*information.modes, *_modes(case.steps, metric)])
+    panels = {mode: _curves(case.steps, f"{metric}:{mode}", looks) for mode in modes}
+    panels = {mode: curves for mode, curves in panels.items() if curves}
+    if not panels:
+        return None
+    columns = 1 if len(panels) <= 3 else 2
+    rows = math.ceil(len(panels) / columns)
+    height = 0.4 + 1.5 * rows + 0.35 * (len(panels) % columns)  # an odd one needs a second x-axis
+    figure, axes = _panels(rows, columns, height)
+    for unused in axes[len(panels) :]:
+        unused.remove()
+    axes = axes[: len(panels)]
+    for ax, (mode, curves) in zip(axes, panels.items(), strict=True):
+        _show_true_mode(ax, case.truth, mode)
+        for estimator, curve in curves.items():
+            _plot_curve(ax, curve, looks[estimator])
+        ax.set_title(_plain(mode, 60), loc="left")
+    drawn = [curve for curves in panels.values() for curve in curves.values()]
+    _frame_time(axes[-columns:], drawn, case.truth)
+    axes[0].set_ylim(-0.02, 1.02 * max(1.0, *(np.nanmax(curve.value) for curve in drawn)))
+    for ax in axes[::columns]:
+        ax.set_ylabel(metric.replace("_", " "))
+    name = {"mode_likelihood": "normalised mode likelihood"}.get(metric, "mode probability")
+    _finish(figure, case.title, f"Mean {name} {_over(drawn, information.runs)}", [])
+    return figure
+
+
+def _scale_error(ax: Axes, values: Mapping[str, Array]) -> list[str]:
+    """A log scale if one curve would squash the others; returns the curves that leave the frame."""
+    ax.set_ylim(bottom=0.0)
+    ax.yaxis.set_major_formatter(_plain_numbers())
+    positive = [value[value > 0] for value in values.values() if (value > 0).any()]
+    best = min((float(np.median(value)) for value in positive), default=math.inf)
+    highest = max((float(value.max()) for value in positive), default=0.0)
+    if highest <= LOG_SCALE_RATIO * best:
+        return []
+    low = 0.8 * max(min(float(value.min()) for value in positive), best / 100)
+    high = 1.25 * min(highest, LEAVES_THE_FRAME * best)
+    ax.set_yscale("log")
+    ax.set_ylim(low, high)
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 3000 * low else (1,)))
+    ax.yaxis.set_major_formatter(_plain_numbers())
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    return [name for name, value in values.items() if (value > high).any()]
+
+
+def _over(curves: Iterable[Curve], runs: int) -> str:
+    bands = any(np.isfinite(curve.standard_error).any() for curve in curves)
+    return f"over {runs:,} run{'s' * (runs != 1)}" + "; bands: ±2 standard errors" * bands
+
+
+def _plot_curve(ax: Axes, curve: Curve, look: Look) -> None:
+    """The curve and its band of two standard errors on either side."""
+    time, value, error = _broken_at_gaps(*curve)
+    _plot_line(ax, time, value, look)
+    low, high = value - 2 * error, value + 2 * error
+    ax.fill_between(time, low, high, color=look.colour, alpha=0.2, linewidth=0)
+
+
+def _plot_line(ax: Axes, x: Array, y: Array, look: Look) -> None:
+    """A line broken at NaN; a point without neighbours, which a line would lose, gets a dot."""
+    width = 1.3 if len(x) <= 500 else 0.8
+    ax.plot(x, y, color=look.colour, linestyle=look.dashes, linewidth=width, label=look.label)
+    known = np.pad(np.isfinite(x + y), 1)
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    if alone.any():
+        ax.plot(x[alone], y[alone], ".", color=look.colour, markersize=3)
+
+
+def _mark_switches(ax: Axes, times: Array) -> None:
+    if len(times):
+        width = 0.8 if len(times) <= 40 else 0.4
+        transform = ax.get_xaxis_transform()
+        lines = ax.vlines(times, 0, 1, SWITCH_COLOUR, linewidth=width, transform=transform)
+        lines.set(zorder=0.5, label="mode switch", gid="mode switch")
+
+
+def _show_true_mode(ax: Axes, truth: Truth | None, mode: str) -> None:
+    """Shade the stays of a fixed truth in `mode`; dash the share of runs if the truth is random."""
+    if truth is None or mode not in truth.modes:
+        return
+    share = truth.share[:, truth.modes.index(mode)]
+    if truth.fixed:
+        transform = ax.get_xaxis_transform()
+        inside = np.nan_to_num(share)
+        shade = ax.stairs(inside, truth.edges, fill=True, transform=transform)
+        shade.set(facecolor=TRUE_MODE_COLOUR, zorder=0.5, label="true mode", gid="true mode")
+    else:
+        time, share = _broken_at_gaps(truth.edges[1:], share)
+        _plot_line(ax, time, share, Look("truth: share of runs", TRUTH_COLOUR, (0, (4, 3))))
+
+
+def _frame_time(bottom: Iterable[Axes], curves: Iterable[Curve], truth: Truth | None) -> None:
+    edges = [] if truth is None else [truth.edges]
+    times = np.concatenate([*(curve.time for curve in curves), *edges])
+    for ax in bottom:
+        ax.set_xlabel("time (s)")
+        ax.tick_params(labelbottom=True)
+        if np.ptp(times) > 0:
+            ax.set_xlim(times.min(), times.max())
+
+
+# ---- around the axes ----
+
+
+def _panels(rows: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    return figure, list(axes.flat)
+
+
+def _finish(figure: Figure, title: str, caption: str, leaving: Iterable[str]) -> None:
+    """Title and caption above the axes, the legend below them, and height for both."""
+    gone = ", ".join(leaving)
+    caption += f"; leaves the frame: {gone}" if gone else ""
+    heading = f"{_plain(title, 88)}\n{_plain(caption, 96)}"
+    figure.suptitle(heading, x=0.01, horizontalalignment="left")
+    handles: dict[str, Any] = {}
+    for ax in figure.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    longest = max(len(line) for label in handles for line in label.split("\n"))
+    rows = math.ceil(len(handles) / max(1, 104 // (longest + 9)))
+    style: dict[str, Any] = {"frameon": False, "handlelength": 2.8}
+    columns = math.ceil(len(handles) / rows)
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, **style)
+    lines = rows + heading.count("\n") + 1 + sum(label.count("\n") for label in handles)
+    figure.set_figheight(figure.get_figheight() + 0.16 * lines)
+
+
+def _plain(text: str, width: int) -> str:
+    """Text that fits, its dollar signs not taken for mathematics."""
+    return textwrap.fill(text, width).replace("$", r"\$")
+
+
+def _plain_numbers(unit: float = 1.0) -> FuncFormatter:
+    return FuncFormatter(lambda value, _: f"{value / unit:,.10g}".replace("-", "−"))

@@ -1,0 +1,342 @@
+"""Truth and measurements: trajectory legs or a simulated chain, then what a sensor sees of it.
+
+Randomness is keyed (seed, case, block, purpose). A whole block is always drawn and the surplus
+thrown away, and each purpose has a stream of its own that is read on from span to span: run r
+depends neither on how many runs were asked for nor on the length of spans.
+"""
+
+import enum
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridtrack.compiled import kernel
+from hybridtrack.errors import UserError
+from hybridtrack.models import Array, JumpMarkovModel, ModeBank
+
+BLOCK_RUNS = 256  # runs drawn and filtered together
+
+Modes = NDArray[np.int64]
+
+
+class Purpose(enum.IntEnum):
+    """What a random stream is for."""
+
+    INITIAL_STATE = 0
+    MODE_SEQUENCE = 1
+    PROCESS_NOISE = 2
+    MEASUREMENT_NOISE = 3
+    DETECTION = 4
+    OUTLIERS = 5
+    INITIAL_ESTIMATE = 6
+
+
+def stream(seed: int, case: int, block: int, purpose: Purpose) -> np.random.Generator:
+    """The random stream of one purpose in one block of one case."""
+    key = np.random.SeedSequence(seed, spawn_key=(case, block, int(purpose)))
+    return np.random.Generator(np.random.Philox(key))
+
+
+# ---- trajectory legs -------------------------------------------------------------------------
+
+
+class Leg(NamedTuple):
+    """A straight flight or a coordinated turn (an exact arc) until `until_s`."""
+
+    until_s: float
+    turn_rate_rad_s: float  # positive to the right: headings run clockwise from north
+    speed_m_s: float
+    mode: int
+
+
+class FixedTruth(NamedTuple):
+    """One trajectory, the same in every run."""
+
+    state: Array  # (n_steps + 1, n_states), from k = 0
+    mode: Modes  # (n_steps + 1,), the mode that drives the step to k; -1 where there is none
+    state_names: tuple[str, ...]
+
+
+def fly(
+    legs: tuple[Leg, ...], times_s: Array, position_m: tuple[float, float], heading_rad: float
+) -> FixedTruth:
+    """Fly the legs from a start at times_s[0] and note the state (x, vx, y, vy) at every time.
+
+    Coordinated turns are exact circular arcs. A step's mode is that of the leg in which it ends.
+    """
+    state = np.empty((len(times_s), 4))
+    mode = np.empty(len(times_s), dtype=np.int64)
+    ends = np.array([leg.until_s for leg in legs])
+    index = np.minimum(np.searchsorted(ends, times_s, side="left"), len(legs) - 1)
+    position, heading, begin = np.array(position_m, dtype=float), heading_rad, float(times_s[0])
+    for number, leg in enumerate(legs):
+        here = index == number
+        state[here] = _arc(leg, times_s[here] - begin, position, heading)
+        mode[here] = leg.mode
+        last = _arc(leg, np.array([leg.until_s - begin]), position, heading)[0]
+        position, begin = last[[0, 2]], leg.until_s
+        duration = leg.until_s - (float(times_s[0]) if number == 0 else legs[number - 1].until_s)
+        heading += leg.turn_rate_rad_s * duration
+    return FixedTruth(state, mode, ("x", "vx", "y", "vy"))
+
+
+def _arc(leg: Leg, elapsed_s: Array, position: Array, heading: float) -> Array:
+    """The chord of an arc: as long as v t sin(a/2)/(a/2), halfway between the headings."""
+    angle = leg.turn_rate_rad_s * elapsed_s
+    chord = leg.speed_m_s * elapsed_s * np.sinc(angle / (2 * np.pi))
+    bearing = heading + angle / 2
+    return np.stack(
+        [
+            position[0] + chord * np.sin(bearing),
+            leg.speed_m_s * np.sin(heading + angle),
+            position[1] + chord * np.cos(bearing),
+            leg.speed_m_s * np.cos(heading + angle),
+        ],
+        axis=1,
+    )
+
+
+# ---- a simulated chain -----------------------------------------------------------------------
+
+
+class ChainTruth(NamedTuple):
+    """States simulated from a jump Markov model of their own, other in every run."""
+
+    bank: ModeBank
+    initial_mean: Array  # (n_x,)
+    initial_covariance: Array  # (n_x, n_x); 0 for a fixed start
+
+
+Truth = FixedTruth | ChainTruth
+
+
+class TruthSpan(NamedTuple):
+    """The truth of a span; the last axis is 1 where it is the same in every run."""
+
+    state: Array  # (n_steps, n_states, lanes or 1)
+    mode: Modes  # (n_steps, lanes or 1), -1 where there is none
+    since_switch_s: Array  # (n_steps, lanes or 1) since the last switch of mode; inf before it
+
+
+@kernel
+def _draw_modes(mode, uniform, cumulative, out):
+    for k in range(uniform.shape[0]):
+        rows = cumulative[k if cumulative.shape[0] > 1 else 0]
+        for b in range(uniform.shape[1]):
+            j = 0
+            while j < rows.shape[1] - 1 and uniform[k, b] >= rows[mode[b], j]:
+                j += 1
+            mode[b] = j
+            out[k, b] = j
+
+
+@kernel
+def _drive(state, modes, noise, state_transition, input_effect, noise_root, out):
+    n_x, lanes = state.shape
+    for k in range(modes.shape[0]):
+        f = k if state_transition.shape[0] > 1 else 0
+        for a in range(n_x):
+            for b in range(lanes):
+                j = modes[k, b]
+                value = input_effect[f, j, a]
+                for e in range(n_x):
+                    value += state_transition[f, j, a, e] * state[e, b]
+                    value += noise_root[f, j, a, e] * noise[k, e, b]
+                out[k, a, b] = value
+        state[:] = out[k]
+
+
+def square_root(covariance: Array) -> Array:
+    """L (..., n, n) with L L' = covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))[..., np.newaxis, :]
+    return root
+
+
+# ---- the sensor ------------------------------------------------------------------------------
+
+
+class Sensor(NamedTuple):
+    """What is measured: positions with Gaussian noise, some scans missed."""
+
+    noise_covariance: Array  # (n_modes or 1, n_y, n_y) by the truth's mode
+    detection_probability: float
+    certain_scans: int  # the first scans are never missed (a track starts with detections)
+
+
+class Scans(NamedTuple):
+    """A span of truth and of measurements."""
+
+    truth: TruthSpan
+    measurements: Array  # (n_steps, n_y, lanes), NaN where missed
+
+
+class Case(NamedTuple):
+    """One truth with its own times; an experiment has one or more."""
+
+    name: str
+    times_s: Array  # (n_steps + 1,) from k = 0
+    truth: Truth
+    recorded: Array | None = None  # (n_steps + 1, n_y): measurements as recorded, no sensor drawn
+
+
+def spans(n_steps: int, length: int) -> Iterator[slice]:
+    """Steps 0 .. n_steps cut into spans of the given length."""
+    for begin in range(0, n_steps, length):
+        yield slice(begin, min(begin + length, n_steps))
+
+
+class BlockSimulation:
+    """Truth and measurements of one block of runs, span by span."""
+
+    def __init__(
+        self, case: Case, sensor: Sensor, seed: int, case_index: int, block: int, lanes: int
+    ) -> None:
+        """lanes: how many of the block's runs are kept of what is drawn."""
+        self._lanes = lanes
+        self._case = case
+        self._sensor = sensor
+        self._streams = {purpose: stream(seed, case_index, block, purpose) for purpose in Purpose}
+        self._noise_root = square_root(sensor.noise_covariance)
+        truth = case.truth
+        if isinstance(truth, ChainTruth):
+            self.state_names = truth.bank.state_names
+            n_x = len(self.state_names)
+            draws = self._streams[Purpose.INITIAL_STATE].standard_normal((n_x, BLOCK_RUNS))
+            self._state = truth.initial_mean[:, None] + (
+                square_root(truth.initial_covariance) @ draws
+            )
+            uniform = self._streams[Purpose.MODE_SEQUENCE].random(BLOCK_RUNS)
+            cumulative = np.cumsum(truth.bank.initial_mode_probabilities)[:-1]
+            self._mode: Modes = np.searchsorted(cumulative, uniform, side="right")
+            self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
+            self.initial_state = self._state[:, :lanes].copy()
+        else:
+            self.state_names = truth.state_names
+            self.initial_state = truth.state[0][:, np.newaxis]
+            self._since_switch_s = _since_switch(case.times_s, truth.mode)
+        self._positions = [
+            self.state_names.index(axis) for axis in "xy" if axis in self.state_names
+        ]
+
+    def initial_estimate_noise(self, n_x: int) -> Array:
+        """Standard normal draws (n_x, lanes) for a start drawn about the truth."""
+        draws = self._streams[Purpose.INITIAL_ESTIMATE].standard_normal((n_x, BLOCK_RUNS))
+        return draws[:, : self._lanes]
+
+    def advance(self, span: slice) -> Scans:
+        """Truth and measurements of the next span of steps."""
+        truth, measurements = self._draw(span)
+        kept = [np.ascontiguousarray(array[..., : self._lanes]) for array in truth]
+        return Scans(TruthSpan(*kept), np.ascontiguousarray(measurements[..., : self._lanes]))
+
+    def _draw(self, span: slice) -> Scans:
+        truth = self._advance_truth(span)
+        n_y = self._sensor.noise_covariance.shape[-1]
+        steps = span.stop - span.start
+        if self._case.recorded is not None:
+            scans = self._case.recorded[span.start + 1 : span.stop + 1, :, np.newaxis]
+            return Scans(truth, np.repeat(scans, BLOCK_RUNS, axis=2))
+        draws = self._streams[Purpose.MEASUREMENT_NOISE].standard_normal((steps, n_y, BLOCK_RUNS))
+        measurements = truth.state[:, self._positions] + self._shape_noise(draws, truth.mode)
+        if self._sensor.detection_probability < 1.0:
+            uniform = self._streams[Purpose.DETECTION].random((steps, BLOCK_RUNS))
+            missed = uniform >= self._sensor.detection_probability
+            missed[: max(self._sensor.certain_scans - span.start, 0)] = False
+            measurements[np.repeat(missed[:, np.newaxis], n_y, axis=1)] = np.nan
+        return Scans(truth, measurements)
+
+    def _shape_noise(self, draws: Array, modes: Modes) -> Array:
+        root = self._noise_root
+        if len(root) == 1:
+            if not np.any(root[0] - np.diag(np.diagonal(root[0]))):
+                draws *= np.diagonal(root[0])[:, np.newaxis]
+                return draws
+            return np.einsum("ml,klb->kmb", root[0], draws)
+        shaped: Array = np.einsum(
+            "kbml,klb->kmb", root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))], draws
+        )
+        return shaped
+
+    def _advance_truth(self, span: slice) -> TruthSpan:
+        truth, times_s = self._case.truth, self._case.times_s
+        here = slice(span.start + 1, span.stop + 1)
+        if isinstance(truth, FixedTruth):
+            return TruthSpan(
+                truth.state[here, :, np.newaxis],
+                truth.mode[here, np.newaxis],
+                self._since_switch_s[here, np.newaxis],
+            )
+        model = truth_model(truth, np.diff(times_s[span.start : span.stop + 1]))
+        steps, n_x = span.stop - span.start, len(self.state_names)
+        uniform = self._streams[Purpose.MODE_SEQUENCE].random((steps, BLOCK_RUNS))
+        modes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
+        before = self._mode.copy()
+        _draw_modes(self._mode, uniform, np.cumsum(model.transition_matrix, axis=-1), modes)
+        noise = self._streams[Purpose.PROCESS_NOISE].standard_normal((steps, n_x, BLOCK_RUNS))
+        state = np.empty((steps, n_x, BLOCK_RUNS))
+        root = np.ascontiguousarray(square_root(model.process_noise_covariance))
+        arguments: tuple[Any, ...] = (model.state_transition, model.input_effect, root, state)
+        _drive(self._state, modes, noise, *arguments)
+        return TruthSpan(state, modes, self._chain_since_switch(span, before, modes))
+
+    def _chain_since_switch(self, span: slice, before: Modes, modes: Modes) -> Array:
+        times_s = self._case.times_s
+        since = np.empty(modes.shape)
+        for k in range(len(modes)):
+            switched = modes[k] != before
+            self._last_switch_s[switched] = times_s[span.start + k]
+            since[k] = times_s[span.start + k + 1] - self._last_switch_s
+            before = modes[k]
+        return since
+
+
+def _since_switch(times_s: Array, modes: Modes) -> Array:
+    """Seconds (n_steps + 1,) since the start of the last step that began a mode; inf before."""
+    began = np.full(len(times_s), -np.inf)
+    switched = np.flatnonzero(modes[2:] != modes[1:-1]) + 2
+    began[switched] = times_s[switched - 1]
+    return times_s - np.maximum.accumulate(began)
+
+
+def truth_model(truth: ChainTruth, step_s: Array) -> JumpMarkovModel:
+    """The truth's own jump Markov model for the given steps."""
+    return truth.bank.discretise(step_s, truth.initial_mean, truth.initial_covariance)
+
+
+def two_point_start(
+    first: Array,
+    second: Array,
+    step_s: float,
+    noise_covariance: Array,
+    state_names: tuple[str, ...],
+) -> tuple[Array, Array]:
+    """Start from two scans by differencing (Bar-Shalom, Li, Kirubarajan 2001, section 5.5.3).
+
+    first, second (n_y, lanes) positions; gives the mean (n_x, lanes) at the second scan and its
+    covariance (n_x, n_x): R for the position, R/T with it and 2 R/T^2 for the velocity, 0 for an
+    acceleration. Raises UserError where a state is neither position, velocity nor acceleration.
+    """
+    n_x = len(state_names)
+    mean = np.zeros((n_x, first.shape[1]))
+    covariance = np.zeros((n_x, n_x))
+    axes = "xy"[: len(first)]
+    unknown = set(state_names) - {prefix + axis for axis in axes for prefix in ("", "v", "a")}
+    if unknown:
+        raise UserError(
+            f"a start from measurements knows no state '{min(unknown)}'; give initial mean and "
+            "covariance instead"
+        )
+    for m, axis in enumerate(axes):
+        p, v = state_names.index(axis), state_names.index("v" + axis)
+        mean[p] = second[m]
+        mean[v] = (second[m] - first[m]) / step_s
+        for n, other in enumerate(axes):
+            q, w = state_names.index(other), state_names.index("v" + other)
+            r = noise_covariance[m, n]
+            covariance[p, q] = r
+            covariance[p, w] = covariance[v, q] = r / step_s
+            covariance[v, w] = 2 * r / step_s**2
+    return mean, covariance

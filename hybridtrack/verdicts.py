@@ -1,0 +1,96 @@
+"""What became of a published claim: the one place where a verdict is reached.
+
+A claim is a figure ("IMM position RMS is 18 m") or a comparison ("RMIMM has the smaller RMS"), on
+a metric of a run. A figure is met if ours, give or take K standard errors, lies within what the
+printed digits can mean; a comparison holds if the paired difference has the claimed sign by more
+than K standard errors. Agreement within an error wider than the printed digits decides nothing.
+"""
+
+import math
+import re
+from typing import Literal, NamedTuple
+
+from hybridtrack.statistics import Estimate, Paired
+
+K = 3.0  # standard errors allowed: 0.3 % of honest claims miss by more
+
+REPRODUCED = "reproduced"
+ASSUMED = "reproduced with stated assumptions"
+DIRECTION = "direction only"
+NOT_REPRODUCED = "not reproduced"
+UNDECIDED = "undecided: too few runs"
+
+Verdict = Literal[
+    "reproduced", "reproduced with stated assumptions", "direction only", "not reproduced"
+]
+
+
+class Claim(NamedTuple):
+    """A published claim as the scenario states it."""
+
+    claim: str
+    estimator: str | None  # of a figure
+    compare: tuple[str, str] | None  # of a comparison: first, second
+    metric: str
+    window: str
+    value: float | None  # the figure, or the published ratio first/second of a comparison
+    tolerance: float  # half a unit of the last printed digit of `value`
+    sign: str | None  # less | greater: first against second
+    expect: str  # the verdict when last looked at
+    because: str
+
+
+class Outcome(NamedTuple):
+    """A claim with our figure and the verdict; `differs` where it isn't the expected one."""
+
+    claim: Claim
+    ours: Estimate
+    verdict: str
+    differs: bool
+
+
+def printed_tolerance(text: str) -> float:
+    """Half a unit of the last digit of a number as printed: '18' gives 0.5, '2.10' gives 0.005."""
+    match = re.fullmatch(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?", text.strip("'\" "))
+    if match is None:
+        raise ValueError(f"not a printed number: {text!r}")
+    return 0.5 * 10.0 ** (int(match[3] or 0) - len(match[2]))
+
+
+def judge_figure(claim: Claim, ours: Estimate, assumptions: bool) -> Outcome:
+    """The verdict on a published figure; `assumptions`: the scenario filled in what is missing."""
+    return _outcome(claim, ours, _figure(claim, ours, assumptions))
+
+
+def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
+    """The verdict on a comparison; a published ratio is judged too, where there is one."""
+    assert claim.sign is not None
+    gap = ours.difference.value if claim.sign == "greater" else -ours.difference.value
+    allowed = K * ours.difference.standard_error
+    figure = ours.ratio if claim.value is not None else ours.difference
+    if gap > allowed:
+        verdict = REPRODUCED
+        if claim.value is not None:
+            met = _figure(claim, ours.ratio, assumptions)
+            verdict = met if met in (REPRODUCED, ASSUMED) else DIRECTION
+    elif gap < -allowed:
+        verdict = NOT_REPRODUCED
+    else:
+        verdict = UNDECIDED
+    return _outcome(claim, figure, verdict)
+
+
+def _figure(claim: Claim, ours: Estimate, assumptions: bool) -> str:
+    assert claim.value is not None
+    if math.isnan(ours.value):
+        return UNDECIDED
+    error = 0.0 if math.isnan(ours.standard_error) else ours.standard_error
+    if abs(ours.value - claim.value) > claim.tolerance + K * error:
+        return NOT_REPRODUCED
+    if K * error > claim.tolerance or ours.n_runs < 2:
+        return UNDECIDED
+    return ASSUMED if assumptions else REPRODUCED
+
+
+def _outcome(claim: Claim, ours: Estimate, verdict: str) -> Outcome:
+    return Outcome(claim, ours, verdict, verdict not in (claim.expect, UNDECIDED))

@@ -1,0 +1,397 @@
+"""Figures from made tables: a seven-leg flight like the paper's, and an uneven recorded track."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import StepPatch
+
+from hybridtrack.figures import RunInformation, draw, save
+
+ESTIMATORS = ("KF_CV", "KF_CA", "MMAE", "IMM", "RMIMM", "RMIMM_zero")
+LEGS = ((30, 0.0), (50, -3.0), (70, 0.0), (90, 1.5), (110, 0.0), (130, -4.5), (150, 0.0))
+SWITCHES_S = [30.0, 50.0, 70.0, 90.0, 110.0, 130.0]
+SPEED_M_S = 246.9  # 480 knots
+
+Tables = tuple[pd.DataFrame, pd.DataFrame, RunInformation]
+
+
+def rows(time_s: np.ndarray, name: str, value: np.ndarray | float, **columns: object):
+    """A few rows of a long table; `name` is 'ESTIMATOR METRIC'."""
+    estimator, metric = name.split()
+    step = np.arange(1, len(time_s) + 1)
+    table = {"case": "flight", "estimator": estimator, "step": step, "time_s": time_s}
+    return pd.DataFrame(table | {"metric": metric, "value": value} | columns)
+
+
+def track_rows(time_s: np.ndarray, name: str, value: np.ndarray) -> pd.DataFrame:
+    return rows(time_s, name, value, run=0).rename(columns={"metric": "quantity"})
+
+
+def turn_rate(time_s: np.ndarray) -> np.ndarray:
+    ends, rates = np.array(LEGS).T
+    return np.deg2rad(rates[np.searchsorted(ends, time_s)])
+
+
+def lagged(target: np.ndarray, memory: float) -> np.ndarray:
+    weights = memory ** np.arange(60.0)
+    return np.convolve(target, weights / weights.sum())[: len(target)]
+
+
+def seven_legs(estimators: tuple[str, ...] = ESTIMATORS, modes=("CV", "CT")) -> Tables:
+    """150 steps of 1 s; KF_CV is 900 m off in turns; the truth is in modes[0] or modes[1]."""
+    rng = np.random.default_rng(5)
+    t = np.arange(1.0, 151.0)
+    turning = (turn_rate(t) != 0).astype(float)
+    heading = np.cumsum(turn_rate(t))
+    flown = {"x": SPEED_M_S * np.cumsum(np.cos(heading)), "y": np.cumsum(-np.sin(heading) * 246.9)}
+    steps = [rows(t, "raw position_rmse_m", 25.0, standard_error=0.4)]
+    for mode, share in zip(modes, (1 - turning, turning), strict=False):
+        steps.append(rows(t, f"truth mode_probability:{mode}", share, standard_error=np.nan))
+    tracks = []
+    for quantity, path in flown.items():
+        tracks.append(track_rows(t, f"truth {quantity}", path))
+        noisy = path + rng.normal(0, 17.7, 150)
+        tracks.append(track_rows(t, f"measurement {quantity}", noisy))
+    for i, name in enumerate(estimators):
+        late = lagged(turning, 0.5 + 0.05 * i)
+        error = 14 + (900 if name == "KF_CV" else 12 - i) * late
+        steps.append(rows(t, f"{name} position_rmse_m", error, standard_error=error / 50))
+        steps.append(rows(t, f"{name} velocity_rmse_m_s", error / 3, standard_error=error / 90))
+        for quantity, path in flown.items():
+            tracks.append(track_rows(t, f"{name} {quantity}", path + error * rng.normal(size=150)))
+        if name.startswith("KF"):
+            continue
+        for j, mode in enumerate(modes):
+            share = np.abs(1 - j % 2 - late) / ((len(modes) + 1) // 2)
+            steps.append(rows(t, f"{name} mode_probability:{mode}", share, standard_error=0.01))
+            steps.append(rows(t, f"{name} mode_likelihood:{mode}", share, standard_error=0.01))
+    information = RunInformation("IMM and RMIMM on seven legs", 1000, estimators, modes)
+    return pd.concat(steps), pd.concat(tracks), information
+
+
+def recorded() -> Tables:
+    """3,000 uneven steps with a gap of 400 s after step 1200, no truth, no velocity, NaN."""
+    rng = np.random.default_rng(7)
+    jumps = rng.uniform(3.5, 5.5, 3000)
+    jumps[1200] = 400.0
+    t = np.cumsum(jumps)
+    steps, tracks = [], []
+    for name in ("KF", "IMM"):
+        error = 60 + lagged(rng.normal(0, 9, 3000), 0.9)
+        error[700:760] = np.nan
+        steps.append(rows(t, f"{name} position_rmse_m", error, standard_error=error / 20))
+        tracks += [track_rows(t, f"{name} {q}", 200 * t + rng.normal(0, 20, 3000)) for q in "xy"]
+    share = 0.5 + lagged(rng.normal(0, 0.2, 3000), 0.9)
+    steps.append(rows(t, "IMM mode_probability:CV", share, standard_error=np.nan))
+    steps.append(rows(t, "IMM mode_probability:CT", 1 - share, standard_error=np.nan))
+    tracks += [track_rows(t, f"measurement {q}", 200 * t) for q in "xy"]
+    return pd.concat(steps), pd.concat(tracks), RunInformation("A", 20, ("KF", "IMM"), ())
+
+
+@pytest.fixture(scope="module")
+def flight() -> dict[str, Figure]:
+    return draw(*seven_legs())
+
+
+def line(ax: Axes, label: str) -> Line2D:
+    (found,) = [one for one in ax.lines if one.get_label() == label]
+    return found
+
+
+def switch_times(figure: Figure) -> list[float]:
+    marks = [c for c in figure.axes[0].collections if c.get_gid() == "mode switch"]
+    assert all(isinstance(mark, LineCollection) for mark in marks)
+    return [float(segment[0, 0]) for mark in marks for segment in mark.get_segments()]
+
+
+def shades(ax: Axes) -> list[StepPatch]:
+    return [p for p in ax.patches if isinstance(p, StepPatch) and p.get_gid() == "true mode"]
+
+
+def assert_nothing_hidden(figure: Figure) -> None:
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    for ax in figure.axes:
+        assert not box.overlaps(ax.get_tightbbox())  # with its labels, not only its box
+    drawn = figure.get_tightbbox(figure.canvas.get_renderer())  # type: ignore[attr-defined]
+    width, height = figure.get_size_inches()
+    edge = 1e-3  # inches: a fifth of a pixel at 200 dpi
+    assert min(drawn.x0, drawn.y0, width - drawn.x1, height - drawn.y1) > -edge
+
+
+def test_all_five_figures(flight):
+    assert list(flight) == [
+        "trajectory",
+        "position_error",
+        "velocity_error",
+        "mode_probability",
+        "mode_likelihood",
+    ]
+    assert flight["position_error"].axes[0].get_ylabel() == "position RMS error (m)"
+    assert flight["velocity_error"].axes[0].get_ylabel() == "velocity RMS error (m/s)"
+    assert flight["position_error"].axes[0].get_xlabel() == "time (s)"
+    assert "1,000 runs; bands: ±2 standard errors" in flight["position_error"].get_suptitle()
+
+
+def test_curves_and_bands_are_the_tables():
+    steps, tracks, information = seven_legs()
+    figure = draw(steps.sample(frac=1, random_state=1), tracks, information)["position_error"]
+    curve = line(figure.axes[0], "IMM").get_xydata()
+    chosen = steps[(steps["estimator"] == "IMM") & (steps["metric"] == "position_rmse_m")]
+    np.testing.assert_array_equal(curve, chosen[["time_s", "value"]])
+    bands = [c.get_paths()[0].get_extents() for c in figure.axes[0].collections[:-1]]
+    # raw comes first: 25 ± 2 * 0.4, up to rounding
+    np.testing.assert_allclose([bands[0].y0, bands[0].y1], [24.2, 25.8], rtol=1e-12)
+
+
+def test_switches_are_marked_where_the_legs_end(flight):
+    assert switch_times(flight["position_error"]) == SWITCHES_S
+    assert switch_times(flight["velocity_error"]) == SWITCHES_S
+
+
+def test_the_true_mode_is_shaded(flight):
+    for name in ("mode_probability", "mode_likelihood"):
+        straight, turn = flight[name].axes
+        assert straight.get_title(loc="left") == "CV"
+        (shade,) = shades(turn)
+        values, edges, _ = shade.get_data()
+        assert edges[0] == 0.0  # step 1 lasts from 0 to 1 s
+        np.testing.assert_array_equal(edges[1:][values == 1], np.r_[31:51, 71:91, 111:131])
+        np.testing.assert_array_equal(shades(straight)[0].get_data().values, 1 - values)
+
+
+def test_random_truth_is_a_dashed_share_without_switches():
+    steps, tracks, information = seven_legs()
+    is_truth = steps["estimator"] == "truth"
+    steps.loc[is_truth, "value"] = 0.25 + 0.5 * steps.loc[is_truth, "value"]
+    figures = draw(steps, tracks, information)
+    assert switch_times(figures["position_error"]) == []
+    for ax in figures["mode_probability"].axes:
+        assert shades(ax) == []
+        share = line(ax, "truth: share of runs")
+        assert set(share.get_ydata()) == {0.25, 0.75}
+        assert share.is_dashed()
+
+
+def test_no_truth_no_shading():
+    steps, tracks, information = seven_legs()
+    figures = draw(steps[steps["estimator"] != "truth"], tracks, information)
+    assert switch_times(figures["position_error"]) == []
+    assert all(not ax.patches for ax in figures["mode_probability"].axes)
+
+
+def test_unknown_true_modes_are_neither_switch_nor_shade():
+    steps, tracks, information = seven_legs()
+    steps.loc[(steps["estimator"] == "truth") & steps["time_s"].between(28, 35), "value"] = np.nan
+    figures = draw(steps, tracks, information)
+    assert switch_times(figures["position_error"]) == SWITCHES_S[1:]
+    values, edges, _ = shades(figures["mode_probability"].axes[1])[0].get_data()
+    assert edges[1:][values == 1][0] == 36
+
+
+def test_an_estimator_looks_the_same_in_all_figures(flight):
+    looks = {name: set() for name in ESTIMATORS}
+    for figure in flight.values():
+        for ax in figure.axes:
+            for one in ax.lines:
+                if one.get_label() in looks:
+                    looks[one.get_label()].add((one.get_color(), str(one._dash_pattern)))
+    assert all(len(look) == 1 for look in looks.values())
+    assert len(set.union(*looks.values())) == len(ESTIMATORS)
+
+
+def test_a_look_depends_on_the_scenarios_order_only():
+    steps, tracks, information = seven_legs()
+    full = draw(steps, tracks, information)["position_error"].axes[0]
+    absent = draw(steps[steps["estimator"] != "KF_CV"], tracks, information)["position_error"]
+    for name in ESTIMATORS[1:]:
+        assert line(absent.axes[0], name).get_color() == line(full, name).get_color()
+
+
+def test_log_scale_only_when_one_curve_would_squash_the_others():
+    steps, tracks, information = seven_legs()
+    assert draw(steps, tracks, information)["position_error"].axes[0].get_yscale() == "log"
+    calm = steps[steps["estimator"] != "KF_CV"]
+    ax = draw(calm, tracks, information)["position_error"].axes[0]
+    assert ax.get_yscale() == "linear"
+    assert ax.get_ylim()[0] == 0.0
+
+
+def test_a_filter_that_explodes_leaves_the_frame_and_is_named(tmp_path):
+    steps, tracks, information = seven_legs()
+    steps.loc[(steps["estimator"] == "KF_CV") & (steps["time_s"] > 100), "value"] = 1e300
+    steps.loc[(steps["estimator"] == "KF_CV") & (steps["time_s"] > 120), "value"] = np.inf
+    tracks.loc[(tracks["estimator"] == "KF_CV") & (tracks["time_s"] > 100), "value"] = 1e300
+    steps = steps[steps["metric"] == "position_rmse_m"]
+    figures = draw(steps, tracks, information)
+    save(figures, tmp_path)
+    for name in ("position_error", "trajectory"):
+        assert "leaves the frame: KF_CV" in figures[name].get_suptitle()
+        assert figures[name].axes[0].get_ylim()[1] < 1e8
+    t, error = line(figures["position_error"].axes[0], "KF_CV").get_data()
+    np.testing.assert_array_equal(np.isnan(error), t > 120)
+    assert "leaves" not in draw(*seven_legs())["trajectory"].get_suptitle()
+
+
+def test_trajectory_is_true_to_shape_in_km(flight):
+    ax = flight["trajectory"].axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x, east (km)", "y, north (km)")
+    flight["trajectory"].canvas.draw()
+    (x0, y0), (x1, y1) = ax.transData.transform([(0, 0), (1000, 1000)])
+    assert x1 - x0 == pytest.approx(y1 - y0, rel=1e-9)  # rounding
+    assert ax.xaxis.get_major_formatter()(15_000) == "15"
+    assert line(ax, "measurements").get_linestyle() == "None"
+
+
+def test_a_target_at_rest_frames_its_estimates():
+    steps, tracks, information = seven_legs(("IMM",))
+    rest = tracks[tracks["estimator"] == "truth"].assign(value=0.0)
+    figure = draw(steps, pd.concat([rest, tracks[tracks["estimator"] == "IMM"]]), information)
+    assert "leaves" not in figure["trajectory"].get_suptitle()
+
+
+def test_one_dimension_is_position_over_time():
+    steps, tracks, information = seven_legs()
+    tracks = tracks[tracks["quantity"] == "x"]
+    ax = draw(steps, tracks, information)["trajectory"].axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "position x (km)")
+    np.testing.assert_array_equal(line(ax, "truth").get_xdata(), np.arange(1, 151))
+
+
+def test_the_first_run_of_the_first_case_is_drawn():
+    steps, tracks, information = seven_legs()
+    later = [tracks.assign(run=1, value=0.0), tracks.assign(case="second", value=0.0)]
+    figure = draw(steps, pd.concat([tracks, *later]), information)["trajectory"]
+    truth = tracks[(tracks["estimator"] == "truth") & (tracks["quantity"] == "y")]
+    np.testing.assert_array_equal(line(figure.axes[0], "truth").get_ydata(), truth["value"])
+    assert "case flight, run 0" in figure.get_suptitle()
+
+
+def test_a_recorded_track_is_broken_at_gaps_and_nan(tmp_path):
+    steps, tracks, information = recorded()
+    figures = draw(steps, tracks, information)
+    assert list(figures) == ["trajectory", "position_error", "mode_probability"]
+    assert "bands" not in figures["mode_probability"].get_suptitle()
+    x, y = line(figures["position_error"].axes[0], "IMM").get_data()
+    assert np.flatnonzero(np.isnan(x)).tolist() == [1200]
+    assert np.flatnonzero(np.isnan(y)).tolist() == [*range(700, 760), 1200]
+    assert np.isnan(line(figures["trajectory"].axes[0], "IMM").get_xdata()[1200])
+    save(figures, tmp_path)  # a warning of matplotlib's on NaN would be an error here
+    for figure in figures.values():
+        assert_nothing_hidden(figure)
+
+
+def test_a_point_between_gaps_is_a_dot():
+    steps, tracks, information = seven_legs(("IMM",))
+    mine = (steps["metric"] == "position_rmse_m") & (steps["estimator"] == "IMM")
+    steps.loc[mine & steps["step"].isin([9, 11]), "value"] = np.nan
+    ax = draw(steps, tracks, information)["position_error"].axes[0]
+    dots = [one for one in ax.lines if one.get_marker() == "."]
+    assert [one.get_xdata().tolist() for one in dots] == [[10.0]]
+
+
+def test_one_step_and_one_run(tmp_path):
+    steps, tracks, information = seven_legs(("IMM",))
+    first, start = steps[steps["step"] == 1], tracks[tracks["step"] == 1]
+    figures = draw(first.assign(standard_error=np.nan), start, information._replace(runs=1))
+    save(figures, tmp_path)
+    assert figures["position_error"].get_suptitle().endswith("RMS over 1 run")
+
+
+def test_absent_data_leave_figures_out():
+    steps, tracks, information = seven_legs()
+    assert draw(steps.iloc[:0], tracks.iloc[:0], information) == {}
+    unknown = steps["metric"] == "velocity_rmse_m_s"
+    figures = draw(steps.assign(value=steps["value"].mask(unknown)), tracks.iloc[:0], information)
+    assert list(figures) == ["position_error", "mode_probability", "mode_likelihood"]
+
+
+def test_cases_have_figures_of_their_own_up_to_six():
+    steps, tracks, information = seven_legs(("IMM",))
+    steps = steps[steps["metric"] == "position_rmse_m"]
+    cases = ["a/b", "a b", "c", "d", "e-1", "f", "g"]
+    many = pd.concat([steps.assign(case=case) for case in cases])
+    figures = draw(many, tracks.iloc[:0], information)
+    suffixes = ["a_b", "a_b-2", "c", "d", "e-1", "f"]
+    assert list(figures) == [f"position_error-{suffix}" for suffix in suffixes]
+    assert "case a b (2 of 7)" in figures["position_error-a_b-2"].get_suptitle()
+
+
+def test_legend_hides_nothing_and_nothing_is_clipped(flight):
+    for figure in flight.values():
+        assert_nothing_hidden(figure)
+
+
+def test_the_largest_bank_with_long_names_still_fits():
+    estimators = tuple(f"estimator_with_a_long_name_{i}" for i in range(8))
+    modes = ("CV", "CT_left", "CT_right", "CA", "climb")
+    steps, tracks, information = seven_legs(estimators, modes)
+    title = "A title that costs $5 to $6 and goes on" + ", and on" * 12
+    figures = draw(steps, tracks, information._replace(title=title))
+    for figure in figures.values():
+        assert r"\$5 to \$6" in figure.get_suptitle()  # else a formula in italics
+        assert_nothing_hidden(figure)
+        inch = figure.dpi
+        assert all(ax.get_window_extent().height > 1.0 * inch for ax in figure.axes)
+    panels = figures["mode_probability"].axes
+    assert len(panels) == len(modes)
+    assert [ax.get_xlabel() for ax in panels] == ["", "", "", "time (s)", "time (s)"]
+
+
+def test_same_tables_same_bytes_whatever_the_users_settings(tmp_path):
+    steps, tracks, information = seven_legs(("IMM",))
+    steps = steps[steps["metric"] != "velocity_rmse_m_s"]  # drawn like the position's
+    before = save(draw(steps, tracks, information), tmp_path / "first")
+    with matplotlib.rc_context({"font.size": 20, "axes.grid": True, "lines.linewidth": 5}):
+        after = save(draw(steps, tracks, information), tmp_path / "second")
+        assert matplotlib.rcParams["font.size"] == 20
+    assert [path.name for path in before] == [path.name for path in after]
+    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(before, after, strict=True))
+
+
+def test_png_has_200_dpi_and_no_text_chunks(tmp_path, flight):
+    (path,) = save({"trajectory": flight["trajectory"]}, tmp_path)
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    assert int.from_bytes(data[16:20]) == 1400  # 7 inches
+    assert not any(chunk in data for chunk in (b"tEXt", b"iTXt", b"tIME", b"Software"))
+
+
+def test_a_figure_that_fails_leaves_the_old_file_and_no_partial_one(tmp_path, monkeypatch):
+    figure = Figure()
+    old = tmp_path / "trajectory.png"
+    old.write_bytes(b"old")
+
+    def fail(partial: Path, **settings: object) -> None:
+        partial.write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(figure, "savefig", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save({"trajectory": figure}, tmp_path)
+    assert list(tmp_path.iterdir()) == [old]
+    assert old.read_bytes() == b"old"
+
+
+def test_pyplot_is_never_imported():
+    code = (
+        "import sys, pandas as pd; from hybridtrack.figures import *;"
+        "s = pd.DataFrame([['c', 'IMM', k, k, 'position_rmse_m', 9.0, 1.0] for k in (1, 2)],"
+        "columns='case estimator step time_s metric value standard_error'.split());"
+        "t = s.assign(run=0, quantity='x');"
+        "from io import BytesIO;"
+        "[f.savefig(BytesIO()) for f in draw(s, t, RunInformation('', 1, ('IMM',), ())).values()];"
+        "print('matplotlib.figure' in sys.modules, 'matplotlib.pyplot' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"]
