@@ -254,11 +254,12 @@ class _Block:
 
     def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
         runs = self._task.runs
-        bad = ~np.isfinite(estimates.mean[-1, :, :runs]).all(axis=0) & (self._status[label] == 0)
+        finite_now = np.isfinite(estimates.mean[-1, :, :runs]).all(axis=0)
+        bad = np.flatnonzero(~finite_now & (self._status[label] == 0))
         if len(estimates.mean) <= self._first_step - span.start:
             return
-        for b in np.flatnonzero(bad):
-            finite = np.isfinite(estimates.mean[:, :, b]).all(axis=1)
+        for b in bad:
+            finite = np.atleast_1d(np.isfinite(estimates.mean[:, :, b]).all(axis=1))
             begin = max(self._first_step - span.start, 0)
             self._status[label][b] = span.start + begin + int(np.argmin(finite[begin:])) + 1
 

@@ -123,8 +123,8 @@ def _exp(x: float) -> float:
 def _log(x: float) -> float:
     """Natural logarithm for x >= 0 (log 0 = -inf), to about one unit in the last place.
 
-    log(m) = 2 atanh((m - 1)/(m + 1)) for the mantissa in [sqrt(1/2), sqrt(2)); the series' remainder
-    after eleven terms is below 1e-17. Branch-free like `exp`.
+    log(m) = 2 atanh((m - 1)/(m + 1)) for the mantissa in [sqrt(1/2), sqrt(2)); the series'
+    remainder after eleven terms is below 1e-17. Branch-free like `exp`.
     """
     tiny = x < 2.2250738585072014e-308
     y = x * 18014398509481984.0 if tiny else x  # 2**54 brings subnormals up

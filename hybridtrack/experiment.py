@@ -215,7 +215,10 @@ def _unpack(arrays: dict[str, Any]) -> tuple[GroupStatistics, list[Track]]:
         (k[0], k[1], k[2]): SumMoments(*a)
         for k, a in zip(keys["windows"], arrays["windows"], strict=True)
     }
-    tracks = [Track(*k, a) for k, a in zip(keys["tracks"], arrays["tracks"], strict=True)]
+    tracks = [
+        Track(int(k[0]), str(k[1]), str(k[2]), a)
+        for k, a in zip(keys["tracks"], arrays["tracks"], strict=True)
+    ]
     return GroupStatistics(steps, windows, keys["diverged"]), tracks
 
 
@@ -264,7 +267,7 @@ def _steps_table(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
     for case, group in zip(experiment.cases, cases, strict=True):
         times_s = case.times_s[1:]
         for (label, quantity), moments in group.steps.items():
-            n = moments.count
+            n = moments.n
             with np.errstate(invalid="ignore", divide="ignore"):
                 mean = np.where(n > 0, moments.mean, np.nan)
                 error = np.sqrt(moments.squares / (n * (n - 1)))
@@ -380,6 +383,7 @@ def _published_table(
                 claim.metric,
                 claim.window,
                 claim.value,
+                claim.sign,
                 ours.value,
                 ours.standard_error,
                 outcome.verdict,

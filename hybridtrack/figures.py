@@ -6,7 +6,6 @@ drawing needs no display, changes no global state, and gives the same bytes for 
 
 import math
 import os
-import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,16 +19,26 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hybridtrack.curves import (
+    Array,
+    Case,
+    Curve,
+    Truth,
+    broken_at_gaps,
+    mode_names,
+    read_curves,
+    read_paths,
+    split_cases,
+    switch_times,
+)
+from hybridtrack.errors import UserError
+
 Dashes = str | tuple[float, tuple[float, ...]]
 
 DPI = 200
 WIDTH_IN = 7.0  # two columns of a journal page
 HALVES = np.array([-0.5, 0.5])
-MOST_CASES = 6
-GAP_IN_MEDIAN_STEPS = 5.0
 LOG_SCALE_RATIO = 15.0
 LEAVES_THE_FRAME = 1e5  # a curve this many times the best one's median has nothing left to tell
 
@@ -83,36 +92,6 @@ class Look(NamedTuple):
 Looks = Mapping[str, Look]
 
 
-class Curve(NamedTuple):
-    """One metric of one estimator over time, each (n_steps,); time in s, NaN where unknown."""
-
-    time: Array
-    value: Array
-    standard_error: Array
-
-
-class Truth(NamedTuple):
-    """Share of the runs whose true mode is each mode, (n_steps, n_modes).
-
-    Mode k drives the step from k-1 to k, so step k lasts from edges[k-1] to edges[k], with
-    `edges` (n_steps + 1,) in s. The truth is `fixed` if it is the same in all runs.
-    """
-
-    edges: Array
-    modes: tuple[str, ...]
-    share: Array
-    fixed: bool
-
-
-class Case(NamedTuple):
-    """One case's rows of the steps' table, its true modes if known, and how its figures say it."""
-
-    steps: pd.DataFrame
-    truth: Truth | None
-    suffix: str
-    title: str
-
-
 def draw(
     steps: pd.DataFrame, tracks: pd.DataFrame, information: RunInformation
 ) -> dict[str, Figure]:
@@ -131,7 +110,7 @@ def draw(
     with _style():
         looks = _looks(steps, tracks, information)
         figures = {"trajectory": _draw_trajectory(tracks, looks, information)}
-        for case in _cases(steps, information.title):
+        for case in split_cases(steps, information.title):
             for quantity, unit in (("position", "m"), ("velocity", "m/s")):
                 figure = _draw_error(case, quantity, unit, looks, information.runs)
                 figures[f"{quantity}_error{case.suffix}"] = figure
@@ -143,20 +122,28 @@ def draw(
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
     """Write each figure to `folder`/NAME.png, whole or not at all; the folder is made if missing.
 
-    The same tables give the same bytes: the PNG carries neither date nor software.
+    The same tables give the same bytes: the PNG carries neither date nor software. Raises
+    UserError where the folder cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for name, figure in figures.items():
-        path, partial = folder / f"{name}.png", folder / f".{name}.{os.getpid()}.partial"
-        try:
-            with _style():
-                figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-        paths.append(path)
-    return paths
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return [_save_one(figure, folder / f"{name}.png") for name, figure in figures.items()]
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise UserError(
+            f"{folder}: figures cannot be written here ({reason}); make room or name another folder"
+        ) from None
+
+
+def _save_one(figure: Figure, path: Path) -> Path:
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with _style():
+            figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
 
 
 @contextmanager
@@ -164,23 +151,6 @@ def _style() -> Iterator[None]:
     """Matplotlib's defaults with our sizes, whatever the user's matplotlibrc says."""
     with matplotlib.style.context(["default", STYLE]):
         yield
-
-
-# ---- from tables to curves ----
-
-
-def _cases(steps: pd.DataFrame, title: str) -> list[Case]:
-    names = list(dict.fromkeys(steps["case"]))
-    chosen: dict[str, Case] = {}
-    for number, name in enumerate(names[:MOST_CASES], start=1):
-        table = steps[steps["case"] == name]
-        suffix, where = "", ""
-        if len(names) > 1:
-            suffix = "-" + re.sub(r"[^A-Za-z0-9_-]", "_", name)
-            suffix += f"-{number}" if suffix in chosen else ""
-            where = f", case {name} ({number} of {len(names)})"
-        chosen[suffix] = Case(table, _truth(table), suffix, title + where)
-    return list(chosen.values())
 
 
 def _looks(
@@ -196,61 +166,6 @@ def _looks(
     }
 
 
-def _numbers(values: Any) -> Array:
-    """As float64, NaN for what isn't finite: an infinity cannot be drawn."""
-    numbers = np.asarray(values, dtype=np.float64)
-    return np.where(np.isfinite(numbers), numbers, np.nan)
-
-
-def _curves(table: pd.DataFrame, metric: str, looks: Looks) -> dict[str, Curve]:
-    """The curves of one case and metric by estimator, in the order of `looks`."""
-    chosen = table[table["metric"] == metric].sort_values("step", kind="stable")
-    curves = {}
-    for name in looks:
-        rows = chosen[chosen["estimator"] == name]
-        curve = Curve(*(_numbers(rows[c]) for c in ("time_s", "value", "standard_error")))
-        if np.isfinite(curve.value).any():
-            curves[name] = curve
-    return curves
-
-
-def _modes(table: pd.DataFrame, metric: str) -> tuple[str, ...]:
-    metrics = dict.fromkeys(table["metric"])
-    return tuple(m.removeprefix(f"{metric}:") for m in metrics if m.startswith(f"{metric}:"))
-
-
-def _truth(table: pd.DataFrame) -> Truth | None:
-    """The truth's modes in one case, None if the table doesn't know them."""
-    rows = table[table["estimator"] == "truth"]
-    modes = _modes(rows, "mode_probability")
-    wide = rows.pivot(index=["step", "time_s"], columns="metric", values="value").sort_index()
-    share = _numbers(wide[[f"mode_probability:{mode}" for mode in modes]])
-    if not np.isfinite(share).any():
-        return None
-    time = _numbers(wide.index.get_level_values("time_s"))
-    first = 2 * time[0] - time[1] if len(time) > 1 else time[0]  # k = 0 has no row of its own
-    fixed = bool(np.isin(share[np.isfinite(share)], (0.0, 1.0)).all())
-    return Truth(np.concatenate([[first], time]), modes, share, fixed)
-
-
-def _switches(truth: Truth | None) -> Array:
-    """Times (s) at which a fixed truth switches its mode; none for a random truth."""
-    if truth is None or not truth.fixed:
-        return np.empty(0)
-    change = np.abs(np.diff(truth.share, axis=0)).max(axis=1)  # NaN beside an unknown mode
-    switches: Array = truth.edges[1:-1][change > 0]
-    return switches
-
-
-def _broken_at_gaps(time: Array, *columns: Array) -> list[Array]:
-    """The same columns with a NaN put in wherever the time jumps: no line crosses a gap."""
-    if len(time) < 2:
-        return [time, *columns]
-    jumps = np.diff(time)
-    gaps = np.flatnonzero(jumps > GAP_IN_MEDIAN_STEPS * np.median(jumps)) + 1
-    return [np.insert(column, gaps, np.nan) for column in (time, *columns)]
-
-
 # ---- the trajectory ----
 
 
@@ -263,7 +178,7 @@ def _draw_trajectory(
     case, run = tracks["case"].iloc[0], tracks["run"].iloc[0]
     one = tracks[(tracks["case"] == case) & (tracks["run"] == run)]
     plane = bool(one.loc[one["quantity"] == "y", "value"].notna().any())
-    paths = _paths(one, plane)
+    paths = read_paths(one, plane)
     if not paths:
         return None
     figure, (ax,) = _panels(1, 1, 3.2)
@@ -272,21 +187,6 @@ def _draw_trajectory(
     where = f"case {case}, " if tracks["case"].nunique() > 1 else ""
     _finish(figure, information.title, f"Trajectory, {where}run {run}", leaving)
     return figure
-
-
-def _paths(one: pd.DataFrame, plane: bool) -> dict[str, Array]:
-    """(x, y), or (time, x) without a plane, (2, n_steps), of everything that has a position."""
-    paths = {}
-    for name in dict.fromkeys(one["estimator"]):
-        rows = one[(one["estimator"] == name) & one["quantity"].isin(["x", "y"])]
-        wide = rows.pivot(index=["step", "time_s"], columns="quantity", values="value").sort_index()
-        wide = wide.reindex(columns=["x", "y"])
-        time = _numbers(wide.index.get_level_values("time_s"))
-        x, y = _numbers(wide["x"]), _numbers(wide["y"])
-        path = np.array(_broken_at_gaps(time, *((x, y) if plane else (time, x)))[1:])
-        if np.isfinite(path).all(axis=0).any():
-            paths[name] = path
-    return paths
 
 
 def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> None:
@@ -351,13 +251,13 @@ def _extent(paths: Iterable[Array]) -> Array:
 
 
 def _draw_error(case: Case, quantity: str, unit: str, looks: Looks, runs: int) -> Figure | None:
-    curves = _curves(case.steps, f"{quantity}_rmse_{unit.replace('/', '_')}", looks)
+    curves = read_curves(case.steps, f"{quantity}_rmse_{unit.replace('/', '_')}", looks)
     if not curves:
         return None
     figure, (ax,) = _panels(1, 1, 3.0)
     for name, curve in curves.items():
         _plot_curve(ax, curve, looks[name])
-    _mark_switches(ax, _switches(case.truth))
+    _mark_switches(ax, switch_times(case.truth))
     leaving = _scale_error(ax, {name: curve.value for name, curve in curves.items()})
     _frame_time([ax], curves.values(), case.truth)
     ax.set_ylabel(f"{quantity} RMS error ({unit})")
@@ -369,8 +269,8 @@ def _draw_modes(
     case: Case, metric: str, looks: Looks, information: RunInformation
 ) -> Figure | None:
     """One panel per mode on shared axes, so that a panel compares the estimators."""
-    modes = dict.fromkeys([*information.modes, *_modes(case.steps, metric)])
-    panels = {mode: _curves(case.steps, f"{metric}:{mode}", looks) for mode in modes}
+    modes = dict.fromkeys([*information.modes, *mode_names(case.steps, metric)])
+    panels = {mode: read_curves(case.steps, f"{metric}:{mode}", looks) for mode in modes}
     panels = {mode: curves for mode, curves in panels.items() if curves}
     if not panels:
         return None
@@ -422,7 +322,7 @@ def _over(curves: Iterable[Curve], runs: int) -> str:
 
 def _plot_curve(ax: Axes, curve: Curve, look: Look) -> None:
     """The curve and its band of two standard errors on either side."""
-    time, value, error = _broken_at_gaps(*curve)
+    time, value, error = broken_at_gaps(*curve)
     _plot_line(ax, time, value, look)
     low, high = value - 2 * error, value + 2 * error
     ax.fill_between(time, low, high, color=look.colour, alpha=0.2, linewidth=0)
@@ -457,7 +357,7 @@ def _show_true_mode(ax: Axes, truth: Truth | None, mode: str) -> None:
         shade = ax.stairs(inside, truth.edges, fill=True, transform=transform)
         shade.set(facecolor=TRUE_MODE_COLOUR, zorder=0.5, label="true mode", gid="true mode")
     else:
-        time, share = _broken_at_gaps(truth.edges[1:], share)
+        time, share = broken_at_gaps(truth.edges[1:], share)
         _plot_line(ax, time, share, Look("truth: share of runs", TRUTH_COLOUR, (0, (4, 3))))
 
 

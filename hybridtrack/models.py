@@ -155,7 +155,8 @@ def _matrix_exponential(generator: bytes, step_s: float) -> Array:
     flat = np.frombuffer(generator)
     n = round(flat.size**0.5)
     matrix: Array = np.maximum(expm(flat.reshape(n, n) * step_s), 0.0)
-    return matrix / matrix.sum(axis=1, keepdims=True)
+    matrix /= matrix.sum(axis=1, keepdims=True)
+    return matrix
 
 
 def generator_from_sojourns(mean_sojourn_s: Array) -> Array:

@@ -68,6 +68,7 @@ SCHEMAS = {
             ("metric", pa.string()),
             ("window", pa.string()),
             ("published", pa.float64()),
+            ("sign", pa.string()),
             ("ours", pa.float64()),
             ("standard_error", pa.float64()),
             ("verdict", pa.string()),
@@ -96,7 +97,7 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield temporary
-        os.replace(temporary, path)
+        temporary.replace(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({_reason(error)})") from None
     finally:
@@ -166,10 +167,12 @@ class RunFolder:
         row group, so that one can be read without the others.
         """
         self._shards.mkdir(exist_ok=True)
-        with replacing(self._shards / f"{name}.parquet") as temporary:
-            with pq.ParquetWriter(temporary, cells[0].schema, compression="zstd") as writer:
-                for cell in cells:
-                    writer.write_table(cell)
+        with (
+            replacing(self._shards / f"{name}.parquet") as temporary,
+            pq.ParquetWriter(temporary, cells[0].schema, compression="zstd") as writer,
+        ):
+            for cell in cells:
+                writer.write_table(cell)
         with replacing(self._shards / f"{name}.npz") as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
 
@@ -284,7 +287,8 @@ def read_table(path: Path, name: str) -> pd.DataFrame:
     """A table of a run folder. Raises UserError where it is missing or damaged."""
     file = path / f"{name}.parquet"
     try:
-        return pq.read_table(file).to_pandas()
+        table: pd.DataFrame = pq.read_table(file).to_pandas()
+        return table
     except FileNotFoundError:
         raise UserError(
             f"{file}: missing from the run folder; repeat the run with --force"

@@ -229,8 +229,13 @@ class BlockSimulation:
     def advance(self, span: slice) -> Scans:
         """Truth and measurements of the next span of steps."""
         truth, measurements = self._draw(span)
-        kept = [np.ascontiguousarray(array[..., : self._lanes]) for array in truth]
-        return Scans(TruthSpan(*kept), np.ascontiguousarray(measurements[..., : self._lanes]))
+        lanes = self._lanes
+        kept = TruthSpan(
+            np.ascontiguousarray(truth.state[..., :lanes]),
+            np.ascontiguousarray(truth.mode[..., :lanes]),
+            np.ascontiguousarray(truth.since_switch_s[..., :lanes]),
+        )
+        return Scans(kept, np.ascontiguousarray(measurements[..., :lanes]))
 
     def _draw(self, span: slice) -> Scans:
         truth = self._advance_truth(span)
@@ -254,10 +259,10 @@ class BlockSimulation:
             if not np.any(root[0] - np.diag(np.diagonal(root[0]))):
                 draws *= np.diagonal(root[0])[:, np.newaxis]
                 return draws
-            return np.einsum("ml,klb->kmb", root[0], draws)
-        shaped: Array = np.einsum(
-            "kbml,klb->kmb", root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))], draws
-        )
+            shaped: Array = np.einsum("ml,klb->kmb", root[0], draws)
+        else:
+            by_run = root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))]
+            shaped = np.einsum("kbml,klb->kmb", by_run, draws)
         return shaped
 
     def _advance_truth(self, span: slice) -> TruthSpan:

@@ -79,7 +79,7 @@ class Names(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """What a span of estimates is worth: every array (n_steps, lanes), NaN where it isn't defined."""
+    """What a span of estimates is worth: arrays (n_steps, lanes), NaN where not defined."""
 
     quantities: dict[str, Array]
     likelihood_advantage: Array | None  # of the true mode over the best of the others
@@ -201,9 +201,9 @@ def advantage_kept(own: Array, reference: Array) -> Array:
 
 
 class Moments(NamedTuple):
-    """Count, mean and sum of squared deviations of many series; arrays of one shape."""
+    """Number n, mean and sum of squared deviations of many series; arrays of one shape."""
 
-    count: Array
+    n: Array
     mean: Array
     squares: Array
 
@@ -211,7 +211,7 @@ class Moments(NamedTuple):
 class SumMoments(NamedTuple):
     """The same for pairs (sum over a run's steps, their number), of which metrics are ratios."""
 
-    count: Array
+    n: Array
     mean_sum: Array
     mean_number: Array
     sum_squares: Array
@@ -221,18 +221,18 @@ class SumMoments(NamedTuple):
 
 def merge_moments(a: Moments, b: Moments) -> Moments:
     """Moments of two groups together (Chan, Golub, LeVeque 1983, eq. 2.1)."""
-    count = a.count + b.count
-    share = np.divide(b.count, count, out=np.zeros_like(count), where=count > 0)
+    count = a.n + b.n
+    share = np.divide(b.n, count, out=np.zeros_like(count), where=count > 0)
     step = b.mean - a.mean
-    return Moments(count, a.mean + share * step, a.squares + b.squares + a.count * share * step**2)
+    return Moments(count, a.mean + share * step, a.squares + b.squares + a.n * share * step**2)
 
 
 def merge_sum_moments(a: SumMoments, b: SumMoments) -> SumMoments:
     """Chan's merging for pairs."""
-    count = a.count + b.count
-    share = np.divide(b.count, count, out=np.zeros_like(count), where=count > 0)
+    count = a.n + b.n
+    share = np.divide(b.n, count, out=np.zeros_like(count), where=count > 0)
     step, other = b.mean_sum - a.mean_sum, b.mean_number - a.mean_number
-    weight = a.count * share
+    weight = a.n * share
     return SumMoments(
         count,
         a.mean_sum + share * step,

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import StepPatch
 
+from hybridtrack.errors import UserError
 from hybridtrack.figures import RunInformation, draw, save
 
 ESTIMATORS = ("KF_CV", "KF_CA", "MMAE", "IMM", "RMIMM", "RMIMM_zero")
@@ -377,10 +378,17 @@ def test_a_figure_that_fails_leaves_the_old_file_and_no_partial_one(tmp_path, mo
         raise OSError("disk full")
 
     monkeypatch.setattr(figure, "savefig", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(UserError, match=r"cannot be written here \(disk full\)"):
         save({"trajectory": figure}, tmp_path)
     assert list(tmp_path.iterdir()) == [old]
     assert old.read_bytes() == b"old"
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path, flight):
+    (tmp_path / "figures").write_text("a file in the way")
+    with pytest.raises(UserError, match="figures: figures cannot be written here") as caught:
+        save({"trajectory": flight["trajectory"]}, tmp_path / "figures")
+    assert "\n" not in str(caught.value)
 
 
 def test_pyplot_is_never_imported():

@@ -13,7 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hybridtrack.config import reader
-from hybridtrack.config.reader import ScenarioError, dump, parse, read
+from hybridtrack.config.reader import ScenarioError, parse, read
+from hybridtrack.config.writer import dump
 from hybridtrack.errors import UserError
 
 # The database is off so that tests leave nothing behind; no deadline, since machines differ.
@@ -516,7 +517,7 @@ TRICKY = [
 ]
 texts = st.one_of(
     st.sampled_from(TRICKY),
-    st.text(max_size=12).filter(lambda text: not reader._FORBIDDEN.search(text)),
+    st.text(max_size=12).filter(lambda text: not reader.FORBIDDEN.search(text)),
 )
 scalars = st.one_of(
     st.none(),

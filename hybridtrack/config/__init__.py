@@ -5,9 +5,10 @@ from pathlib import Path
 
 from hybridtrack.compiled import PACKAGE
 from hybridtrack.config.build import ChosenEstimator, Experiment, Initial, Window, build
-from hybridtrack.config.reader import Document, ScenarioError, dump, read
+from hybridtrack.config.reader import Document, ScenarioError, read
 from hybridtrack.config.schema import json_schema
 from hybridtrack.config.validate import validate
+from hybridtrack.config.writer import dump
 
 __all__ = [
     "ChosenEstimator",
@@ -20,6 +21,7 @@ __all__ = [
     "find",
     "json_schema",
     "load",
+    "read",
     "shipped",
 ]
 

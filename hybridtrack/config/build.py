@@ -402,7 +402,7 @@ def _times(form: ScenarioForm, document: Document) -> Array:
         raise document.error(
             ("clock", "duration_s"), f"these are {steps:,} steps; at most {MAX_STEPS:,} go"
         )
-    return np.arange(steps + 1) * clock.step_s
+    return np.arange(steps + 1, dtype=np.float64) * clock.step_s
 
 
 def _legs(

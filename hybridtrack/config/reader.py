@@ -7,7 +7,6 @@ is ever constructed, and every limit is kept while the file streams in.
 """
 
 import copy
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -28,7 +27,7 @@ Keys: TypeAlias = tuple[str | int, ...]
 
 # Characters no scenario may hold, raw or escaped: control characters, lone surrogates, and the
 # line breaks of YAML 1.1 that editors don't show as such.
-_FORBIDDEN = re.compile(
+FORBIDDEN = re.compile(
     "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]"
 )
 _TOO_MANY = "a scenario holds at most {} values; keep recordings in files of their own"
@@ -139,7 +138,7 @@ def parse(text_or_bytes: str | bytes, name: str) -> Document:
         raise ScenarioError(f"{name}: there is nothing in it; a scenario is `key: value` lines")
     if not isinstance(data, dict):
         place = places[()]
-        what = "a list" if isinstance(data, list) else f"the single value {_shown(place.text)}"
+        what = "a list" if isinstance(data, list) else f"the single value {shown(place.text)}"
         sentence = f"a scenario is `key: value` lines, but this is {what}"
         raise _error(name, None, place.line, place.column, sentence)
     return Document(name, data, places)
@@ -184,7 +183,7 @@ class _Source(NamedTuple):
 
 
 def _open(text: str, name: str, setting: str | None) -> _Source:
-    found = _FORBIDDEN.search(text)
+    found = FORBIDDEN.search(text)
     if found:
         line = text.count("\n", 0, found.start()) + 1
         column = found.start() - text.rfind("\n", 0, found.start())
@@ -240,7 +239,7 @@ def _mapping(source: _Source, path: Keys, places: dict[Keys, Place]) -> dict[str
         if key in entries:
             first = places[here].line
             raise source.error(
-                event, f"'{_shown(key)}' is here twice (first on line {first}); keep one"
+                event, f"'{shown(key)}' is here twice (first on line {first}); keep one"
             )
         value = source.next()
         places[here] = source.place(event)._replace(text=source.written(value))
@@ -257,22 +256,22 @@ def _key(source: _Source, event: Any) -> str:
         raise source.error(event, "merge keys (<<) are not allowed; write the entries out")
     if not event.value:
         raise source.error(event, "a key is empty; give it a name")
-    key, shown = _scalar(source, event), _shown(event.value)
+    key, text = _scalar(source, event), shown(event.value)
     if not isinstance(key, str):
-        raise source.error(event, f"the key '{shown}' is not text; put it in quotes to make it so")
+        raise source.error(event, f"the key '{text}' is not text; put it in quotes to make it so")
     if len(key) > MAX_KEY_LENGTH:
         limit = f"longer than {MAX_KEY_LENGTH} characters"
-        raise source.error(event, f"the key '{shown}' is {limit}; shorten it")
+        raise source.error(event, f"the key '{text}' is {limit}; shorten it")
     return key
 
 
 def _refuse_references(source: _Source, event: Any) -> None:
     if event.anchor is not None:
         is_alias = isinstance(event, yaml.AliasEvent)
-        what = f"{'aliases (*' if is_alias else 'anchors (&'}{_shown(event.anchor)})"
+        what = f"{'aliases (*' if is_alias else 'anchors (&'}{shown(event.anchor)})"
         raise source.error(event, f"{what} are not allowed in a scenario; write the value out")
     if event.tag is not None:
-        tag = _shown(event.tag.replace("tag:yaml.org,2002:", "!!"))
+        tag = shown(event.tag.replace("tag:yaml.org,2002:", "!!"))
         sentence = f"tags ({tag}) are not allowed in a scenario; put text in quotes instead"
         raise source.error(event, sentence)
 
@@ -281,7 +280,7 @@ def _scalar(source: _Source, event: Any) -> Any:
     """The core schema's reading of a scalar; quoted and block scalars are text."""
     text: str = event.value
     if event.style is not None:
-        found = _FORBIDDEN.search(text)
+        found = FORBIDDEN.search(text)
         if found:
             raise source.error(event, _forbidden(found.group()))
         return text
@@ -292,13 +291,13 @@ def _scalar(source: _Source, event: Any) -> Any:
     for pattern, base in ((_WHOLE, 10), (_OCTAL, 8), (_HEXADECIMAL, 16)):
         if pattern.fullmatch(text):
             if len(text) > MAX_DIGITS:
-                sentence = f"{_shown(text)} has more than {MAX_DIGITS} digits; write a shorter one"
+                sentence = f"{shown(text)} has more than {MAX_DIGITS} digits; write a shorter one"
                 raise source.error(event, sentence)
             return int(text, base)
     if _FLOAT.fullmatch(text) or _NOT_FINITE.fullmatch(text):
         number = float(text) if _FLOAT.fullmatch(text) else math.inf
         if not math.isfinite(number):
-            sentence = f"{_shown(text)} is not a finite number; give one that is"
+            sentence = f"{shown(text)} is not a finite number; give one that is"
             raise source.error(event, sentence)
         return number
     return text
@@ -314,12 +313,12 @@ def _read_setting(setting: str) -> tuple[list[str], Any, dict[Keys, Place]]:
     if not equals or not all(keys):
         sentence = "write a setting as key.path=value, such as monte_carlo.runs=50"
         raise _setting_error(setting, sentence)
-    if found := _FORBIDDEN.search(left):
+    if found := FORBIDDEN.search(left):
         raise _setting_error(setting, _forbidden(found.group()))
     if len(keys) > MAX_NESTING or max(map(len, keys)) > MAX_KEY_LENGTH:
         limits = f"at most {MAX_NESTING} keys of at most {MAX_KEY_LENGTH} characters"
         raise _setting_error(setting, f"a setting has {limits}; shorten it")
-    source = _open(_decoded(text, f"--set {_shown(setting)}"), "", setting)
+    source = _open(_decoded(text, f"--set {shown(setting)}"), "", setting)
     base = tuple(keys)
     places: dict[Keys, Place] = {}
     value = _read_only_document(source, base, places)
@@ -347,7 +346,7 @@ def _assign(data: dict[str, Any], keys: list[str], value: Any, setting: str) -> 
     for depth, key in enumerate(keys):
         if not isinstance(holder, dict | list):
             where = ".".join(keys[:depth])
-            sentence = f"{where} is {_shown(repr(holder))}, which has no entry '{_shown(key)}'"
+            sentence = f"{where} is {shown(repr(holder))}, which has no entry '{shown(key)}'"
             raise _setting_error(setting, sentence)
         index = _item_number(holder, key, ".".join(keys[:depth]), setting)
         path = (*path, index)
@@ -366,7 +365,7 @@ def _item_number(holder: Any, key: str, where: str, setting: str) -> Any:
     count = len(holder)
     if not re.fullmatch("[0-9]{1,9}", key) or int(key) >= count:
         items = f"items 0 to {count - 1}" if count else "no items"
-        raise _setting_error(setting, f"the list {where} has {items}, not '{_shown(key)}'")
+        raise _setting_error(setting, f"the list {where} has {items}, not '{shown(key)}'")
     return int(key)
 
 
@@ -395,99 +394,20 @@ def _error(name: str, setting: str | None, line: int, column: int, sentence: str
 
 
 def _setting_error(setting: str, sentence: str) -> ScenarioError:
-    return ScenarioError(f"--set {_shown(setting)}: {sentence}")
+    return ScenarioError(f"--set {shown(setting)}: {sentence}")
 
 
 def _syntax(problem: str) -> str:
     remedy = next((cure for sign, cure in _REMEDIES if sign in problem), "check this line")
-    return f"this is not YAML: {_shown(problem, 120)}; {remedy}"
+    return f"this is not YAML: {shown(problem, 120)}; {remedy}"
 
 
 def _forbidden(character: str) -> str:
     return f"the control character U+{ord(character):04X} is not allowed; remove it"
 
 
-def _shown(text: str | None, width: int = 60) -> str:
+def shown(text: str | None, width: int = 60) -> str:
     """`text` on one line of bounded length, fit for a terminal."""
     text = text or ""
     short = text if len(text) <= width else f"{text[: width - 1]}…"
     return short if short.isprintable() else ascii(short)[1:-1]
-
-
-# --- writing ---------------------------------------------------------------------------------
-
-# Plain text that no dialect of YAML reads as anything else; all the rest is quoted.
-_PLAIN = re.compile(r"[A-Za-z_]([A-Za-z0-9_ ,;./+()%=*'-]*[A-Za-z0-9_./+()%=*'-])?")
-_WORDS_OF_YAML = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
-
-
-def dump(data: Any) -> str:
-    """`data` as block-style YAML, rows of numbers on one line, in the order given.
-
-    `parse` and any YAML 1.1 reader get the same values and types back (a tuple as a list).
-    Raises ValueError for what `parse` would refuse: numbers that aren't finite, control
-    characters, keys that aren't text; and for types that aren't plain data.
-    """
-    if isinstance(data, dict | list | tuple) and data:
-        return "\n".join(_block(data)) + "\n"
-    return _inline(data) + "\n"
-
-
-def _block(data: Any) -> list[str]:
-    """Lines of a collection that isn't empty."""
-    if isinstance(data, dict):
-        return [line for key, value in data.items() for line in _entry(_written_key(key), value)]
-    return [line for value in data for line in _item(value)]
-
-
-def _entry(key: str, value: Any) -> list[str]:
-    if _fits_one_line(value):
-        return [f"{key}: {_inline(value)}"]
-    return [f"{key}:", *(f"  {line}" for line in _block(value))]
-
-
-def _item(value: Any) -> list[str]:
-    if _fits_one_line(value):
-        return [f"- {_inline(value)}"]
-    first, *rest = _block(value)
-    return [f"- {first}", *(f"  {line}" for line in rest)]
-
-
-def _fits_one_line(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
-    return not isinstance(value, dict) or not value
-
-
-def _inline(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_inline(item) for item in value)}]"
-    if value is None or isinstance(value, bool):
-        return json.dumps(value)
-    if isinstance(value, str):
-        return _written_text(value)
-    if isinstance(value, int) and len(text := int.__repr__(value)) <= MAX_DIGITS:
-        return text
-    if isinstance(value, float) and math.isfinite(value):
-        # YAML 1.1 wants a point in a float: 1e-05 would be text there.
-        mantissa, e, exponent = float.__repr__(value).partition("e")
-        return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"
-    raise ValueError(f"{type(value).__name__} {_shown(repr(value))} has no place in a scenario")
-
-
-def _written_key(key: Any) -> str:
-    if not isinstance(key, str) or not 0 < len(key) <= MAX_KEY_LENGTH:
-        raise ValueError(f"{_shown(repr(key))} can't be a key in a scenario")
-    return _written_text(key)
-
-
-def _written_text(text: str) -> str:
-    if _FORBIDDEN.search(text):
-        raise ValueError(f"{_shown(text)} holds a control character")
-    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS_OF_YAML:
-        return str(text)
-    # JSON's strings are YAML's double-quoted ones. An emoji stays itself: ensure_ascii would
-    # write it as two surrogates, which YAML doesn't join.
-    return json.dumps(text, ensure_ascii=False)

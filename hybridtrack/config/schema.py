@@ -10,7 +10,7 @@ import math
 import types
 import typing
 from functools import reduce
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
@@ -42,7 +42,7 @@ class Form(BaseModel):
         """Rename keys to their SI spelling; refuse unknown keys and two spellings of one."""
         if not isinstance(data, dict):
             return data
-        known = {s: name for name in cls.keys() for s in units.spellings(name)}
+        known = {s: name for name in cls.names() for s in units.spellings(name)}
         converted: dict[str, Any] = {}
         for key, value in data.items():
             name = known.get(key)
@@ -57,7 +57,7 @@ class Form(BaseModel):
         return converted
 
     @classmethod
-    def keys(cls) -> tuple[str, ...]:
+    def names(cls) -> tuple[str, ...]:
         """The keys as a scenario writes them in SI."""
         return tuple(field.alias or name for name, field in cls.model_fields.items())
 
@@ -108,8 +108,8 @@ def _annotation(annotation: Any, limits: tuple[float | None, float | None] | Non
     if origin in (types.UnionType, typing.Union):
         return reduce(lambda a, b: a | b, map(_annotation, typing.get_args(annotation)))
     if limits:
-        bounds = {k: v for k, v in zip(("ge", "le"), limits, strict=True) if v is not None}
-        return Annotated[annotation, Field(**bounds)]
+        smallest, largest = limits
+        return Annotated[annotation, Field(ge=smallest, le=largest)]
     return annotation
 
 
@@ -160,8 +160,13 @@ def _tagged(forms: dict[str, type[Form]], key: str, otherwise: str) -> Any:
 
 MOTION_FORMS = {name: _motion_form(name) for name in MOTION_MODELS} | {"matrices": MatricesForm}
 ESTIMATOR_FORMS = {name: _estimator_form(name) for name in estimators()}
-ModeUnion = _tagged(MOTION_FORMS, "motion", "matrices")
-EstimatorUnion = _tagged(ESTIMATOR_FORMS, "type", "")
+
+if TYPE_CHECKING:  # which form it is, the scenario decides
+    ModeUnion: TypeAlias = Any
+    EstimatorUnion: TypeAlias = Any
+else:
+    ModeUnion = _tagged(MOTION_FORMS, "motion", "matrices")
+    EstimatorUnion = _tagged(ESTIMATOR_FORMS, "type", "")
 
 
 class ChainForm(Form):

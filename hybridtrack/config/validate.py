@@ -73,7 +73,8 @@ def _shown(document: Document, path: Keys) -> str:
     text = document.source_text(path)
     value = value_at(document, path)
     if text is None:
-        text = {dict: "a mapping", list: "a list"}.get(type(value), repr(value))
+        kinds = ((dict, "a mapping"), (list, "a list"))
+        text = next((said for kind, said in kinds if isinstance(value, kind)), repr(value))
     text = text or "empty"
     return text if len(text) <= 60 else text[:57] + "..."
 

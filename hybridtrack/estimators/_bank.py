@@ -679,7 +679,7 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
 
 
 def start(model: JumpMarkovModel, lanes: int, initial_mean: Array | None = None) -> BankState:
-    """The state at k = 0; initial_mean (n_x, lanes) where each run has its own, else the model's."""
+    """The state at k = 0; initial_mean (n_x, lanes) where runs have their own, else the model's."""
     n_modes, _, n_x = model.measurement_matrix.shape
     if initial_mean is None:
         initial_mean = np.repeat(model.initial_mean[:, np.newaxis], lanes, axis=1)

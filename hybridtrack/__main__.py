@@ -1,0 +1,5 @@
+"""`python -m hybridtrack`."""
+
+from hybridtrack.cli import main
+
+main()

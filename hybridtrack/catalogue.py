@@ -1,0 +1,24 @@
+"""What there is to choose from, by name, with a line each."""
+
+from hybridtrack.config import shipped
+from hybridtrack.estimators import estimators
+from hybridtrack.motion import MOTION_MODELS
+from hybridtrack.statistics import METRICS
+
+
+def catalogue() -> dict[str, dict[str, str]]:
+    """Kinds of things, their names and summaries."""
+    return {
+        "estimators": {name: e.summary for name, e in estimators().items()},
+        "motions": {name: m.summary.rstrip(".") for name, m in MOTION_MODELS.items()},
+        "analyses": {},
+        "metrics": {name: m.summary for name, m in METRICS.items()},
+        "scenarios": {name: _title(name) for name in shipped()},
+    }
+
+
+def _title(name: str) -> str:
+    from hybridtrack.config import read
+
+    title = read(shipped()[name]).data.get("title", "")
+    return str(title)

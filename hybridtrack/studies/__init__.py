@@ -1,0 +1,1 @@
+"""Studies over run folders."""
