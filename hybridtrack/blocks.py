@@ -36,6 +36,7 @@ from hybridtrack.statistics import (
 
 SPAN_STEPS = 32  # steps between two looks at Python: their arrays stay in the cache
 LANE_GROUP = 32  # lanes are filtered in whole groups, so that each takes the same instructions
+DIVERGED = 1e150  # an estimate beyond this has no finite square
 
 RAW = "raw"
 TRUTH = "truth"
@@ -179,14 +180,21 @@ class _Block:
                 noise = self._simulation.initial_estimate_noise(len(states))
                 mean += square_root(covariance) @ noise
         self._initial_covariance = covariance
-        self._even_model = self._model(self._even_step_s)
-        for label, estimator, settings in experiment.estimators:
-            self._running[label] = Running(estimator, settings, self._even_model, mean)
-            self._status[label] = np.zeros(self._task.runs, dtype=np.int64)
+        self._even_models = self._models(self._even_step_s)
+        for chosen in experiment.estimators:
+            model = self._even_models[chosen.label]
+            self._running[chosen.label] = Running(chosen.estimator, chosen.settings, model, mean)
+            self._status[chosen.label] = np.zeros(self._task.runs, dtype=np.int64)
 
-    def _model(self, step_s: Array) -> JumpMarkovModel:
-        n_x = len(self._experiment.bank.state_names)
-        return self._experiment.bank.discretise(step_s, np.zeros(n_x), self._initial_covariance)
+    def _models(self, step_s: Array) -> dict[str, JumpMarkovModel]:
+        """Each estimator's model for the given steps; estimators of one bank share it."""
+        nothing = np.zeros(len(self._experiment.bank.state_names))
+        built: dict[int, JumpMarkovModel] = {}
+        for chosen in self._experiment.estimators:
+            bank = chosen.bank
+            if id(bank) not in built:
+                built[id(bank)] = bank.discretise(step_s, nothing, self._initial_covariance)
+        return {c.label: built[id(c.bank)] for c in self._experiment.estimators}
 
     # ---- one span ----
 
@@ -201,14 +209,14 @@ class _Block:
         self._score_truth(span, scans)
         for quantity, values in score_measurements(scans, known).items():
             self._take(span, RAW, quantity, values, masks)
-        model = self._even_model
+        models = self._even_models
         skipped = max(self._first_step - span.start, 0)  # scans used up by a two-point start
         if not self._even:
-            model = self._model(np.diff(self._case.times_s[span.start + skipped : span.stop + 1]))
+            models = self._models(np.diff(self._case.times_s[span.start + skipped : span.stop + 1]))
         advantages: dict[str, Array] = {}
         for label, running in self._running.items():
             estimates = running.advance(
-                model,
+                models[label],
                 np.ascontiguousarray(scans.measurements[skipped:]),
                 covariance=self._task.tracks > 0,
             )
@@ -253,15 +261,19 @@ class _Block:
             self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
 
     def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
-        runs = self._task.runs
-        finite_now = np.isfinite(estimates.mean[-1, :, :runs]).all(axis=0)
-        bad = np.flatnonzero(~finite_now & (self._status[label] == 0))
-        if len(estimates.mean) <= self._first_step - span.start:
-            return
-        for b in bad:
-            finite = np.atleast_1d(np.isfinite(estimates.mean[:, :, b]).all(axis=1))
-            begin = max(self._first_step - span.start, 0)
-            self._status[label][b] = span.start + begin + int(np.argmin(finite[begin:])) + 1
+        """Note the step at which a run diverges; from there on its estimates are NaN."""
+        begin = max(self._first_step - span.start, 0)
+        status = self._status[label]
+        mean = estimates.mean[begin:]
+        if mean.max(initial=0.0) < DIVERGED and mean.min(initial=0.0) > -DIVERGED:
+            return  # nearly always; NaN isn't below anything
+        sound = np.abs(mean).max(axis=1) < DIVERGED
+        for b in np.flatnonzero(~sound.all(axis=0)):
+            first = begin + int(np.argmin(sound[:, b]))
+            if b < self._task.runs and status[b] == 0:
+                status[b] = span.start + first + 1
+            for array in estimates:
+                array[first:, ..., b] = np.nan
 
     def _take(
         self,

@@ -100,8 +100,7 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
     """
     shards = plan(experiment)
     with RunFolder(path, digest(experiment)) as folder:
-        before = results.read_manifest(path) or {}
-        manifest = _manifest(experiment, before)
+        manifest = _manifest(experiment)
         folder.write_manifest(manifest)
         results.write_text(path / "config.yaml", dump(experiment.resolved))
         cases: dict[int, GroupStatistics] = {}
@@ -113,8 +112,6 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
         names = [shard.name for shard in shards]
         n_cells = len(labels(experiment)) * len(experiment.windows)
         folder.assemble_runs(names, n_cells)
-        manifest["shards"] = names
-        folder.write_manifest(manifest)
         folder.drop_parts(names)
         merged = [cases[c] for c in range(len(experiment.cases))]
         folder.write_table("steps", _steps_table(experiment, merged))
@@ -414,7 +411,7 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _manifest(experiment: Experiment, before: dict[str, Any]) -> dict[str, Any]:
+def _manifest(experiment: Experiment) -> dict[str, Any]:
     packages = ("numpy", "scipy", "numba", "pyarrow", "pandas")
     return {
         "status": results.RUNNING,
@@ -438,7 +435,6 @@ def _manifest(experiment: Experiment, before: dict[str, Any]) -> dict[str, Any]:
         "host": {"system": platform.platform(), "machine": platform.machine()},
         "command": sys.argv[1:],
         "started": _now(),
-        "shards": before.get("shards", []),
     }
 
 

@@ -10,6 +10,8 @@ import contextlib
 import json
 import os
 import shutil
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -24,6 +26,16 @@ from hybridtrack.errors import UserError
 
 MANIFEST = "manifest.json"
 RUNNING, COMPLETE = "running", "complete"
+LOCK, PART = ".lock", ".part"
+DAMAGE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    zipfile.BadZipFile,
+    zlib.error,
+    pa.ArrowException,
+)
 Array = NDArray[Any]
 
 SCHEMAS = {
@@ -94,7 +106,7 @@ SCHEMAS = {
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside `path`; moved onto it when all went well, removed otherwise."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
         yield temporary
         temporary.replace(path)
@@ -126,22 +138,27 @@ class RunFolder:
         except OSError as error:
             raise UserError(f"{path}: cannot be made ({_reason(error)})") from None
         manifest = read_manifest(path)
-        if manifest is None and any(p.name != ".lock" for p in path.iterdir()):
+        if manifest is None and _holds_something(path):
             raise UserError(f"{path}: this folder holds something else; name another with --out")
         if manifest is not None and manifest.get("digest") != digest:
             raise UserError(
                 f"{path}: this folder holds another run ({manifest.get('name')}, digest "
                 f"{manifest.get('digest')}); name another with --out, or add --force"
             )
-        self._lock: IO[str] | None = None
+        self._lock = contextlib.ExitStack()
+        self._assembled: list[str] = []  # shards whose runs runs.parquet holds, in its order
 
     def __enter__(self) -> "RunFolder":
-        self._lock = _locked(self.path / ".lock")
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(_locked(self.path / LOCK))
+            for part in self.path.glob(f".*{PART}"):  # of a killed process
+                part.unlink(missing_ok=True)
+            self._assembled = _shards_in(self.path / "runs.parquet")
+            self._lock = stack.pop_all()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._lock is not None:
-            self._lock.close()
+        self._lock.close()
 
     # ---- shards ----
 
@@ -152,13 +169,8 @@ class RunFolder:
     def has_shard(self, name: str) -> bool:
         """Whether the statistics and the runs of a shard are at hand."""
         return (self._shards / f"{name}.npz").exists() and (
-            (self._shards / f"{name}.parquet").exists() or name in self._assembled()
+            (self._shards / f"{name}.parquet").exists() or name in self._assembled
         )
-
-    def _assembled(self) -> list[str]:
-        manifest = read_manifest(self.path)
-        names = manifest.get("shards", []) if manifest else []
-        return names if (self.path / "runs.parquet").exists() else []
 
     def save_shard(self, name: str, arrays: Mapping[str, Any], cells: Sequence[pa.Table]) -> None:
         """Put a shard away: its runs first, so that statistics are never without them.
@@ -166,7 +178,10 @@ class RunFolder:
         cells: a table of runs per estimator and window, always in the same order; each becomes a
         row group, so that one can be read without the others.
         """
-        self._shards.mkdir(exist_ok=True)
+        try:
+            self._shards.mkdir(exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{self._shards}: cannot be made ({_reason(error)})") from None
         with (
             replacing(self._shards / f"{name}.parquet") as temporary,
             pq.ParquetWriter(temporary, cells[0].schema, compression="zstd") as writer,
@@ -182,39 +197,28 @@ class RunFolder:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 return {key: archive[key] for key in archive.files}
-        except (OSError, ValueError, EOFError, KeyError) as error:
-            raise UserError(
-                f"{path}: this shard is damaged ({error}); repeat the run with --force"
-            ) from None
+        except DAMAGE as error:
+            raise _damaged(path, error) from None
 
     def assemble_runs(self, names: list[str], n_cells: int) -> None:
-        """runs.parquet from the shards' row groups; memory holds one shard at a time."""
-        previous = self._assembled()
+        """runs.parquet from the shards' row groups; memory holds one of these at a time.
+
+        The file says which shards it holds, so that it can be gone on from whenever this process
+        is killed.
+        """
         target = self.path / "runs.parquet"
-        old = pq.ParquetFile(target) if previous else None
-        writer: pq.ParquetWriter | None = None
-        try:
-            with replacing(target) as temporary:
-                for name in names:
-                    part = self._shards / f"{name}.parquet"
-                    source, first = old, 0
-                    if part.exists():
-                        source = pq.ParquetFile(part)
-                    else:
-                        first = n_cells * previous.index(name)
-                    assert source is not None
-                    for group in range(first, first + n_cells):
-                        table = source.read_row_group(group)
-                        if writer is None:
-                            writer = pq.ParquetWriter(temporary, table.schema, compression="zstd")
-                        writer.write_table(table)
-                    if source is not old:
-                        source.close()
-                assert writer is not None
-                writer.close()
-        finally:
-            if old is not None:
-                old.close()
+        with replacing(target) as temporary, contextlib.ExitStack() as stack:
+            writer: pq.ParquetWriter | None = None
+            for name in names:
+                source, first = self._shards / f"{name}.parquet", 0
+                if not source.exists():
+                    source, first = target, n_cells * self._assembled.index(name)
+                for table in _row_groups(source, first, n_cells):
+                    if writer is None:
+                        schema = table.schema.with_metadata({"shards": json.dumps(names)})
+                        writer = pq.ParquetWriter(temporary, schema, compression="zstd")
+                        stack.callback(writer.close)
+                    writer.write_table(table)
 
     def drop_parts(self, names: list[str]) -> None:
         """Remove what runs.parquet now holds, and shards that are no part of this run."""
@@ -237,8 +241,46 @@ class RunFolder:
         write_text(self.path / MANIFEST, json.dumps(manifest, indent=2) + "\n")
 
 
+def _holds_something(path: Path) -> bool:
+    """Whether a folder without a manifest holds more than a killed run's first files."""
+    return any(p.name != LOCK and not p.name.endswith(PART) for p in path.iterdir())
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    said = " ".join(str(error).split()).rstrip(".")
+    return UserError(f"{path}: this file is damaged ({said}); repeat the run with --force")
+
+
+def _missing(path: Path) -> UserError:
+    return UserError(f"{path}: missing from the run folder; repeat the run with --force")
+
+
+def _shards_in(path: Path) -> list[str]:
+    """The shards whose runs a runs.parquet holds; none where there is no such file."""
+    try:
+        names: list[str] = json.loads((pq.read_schema(path).metadata or {})[b"shards"])
+        return names
+    except FileNotFoundError:
+        return []
+    except DAMAGE as error:
+        raise _damaged(path, error) from None
+
+
+def _row_groups(path: Path, first: int, number: int) -> Iterator[pa.Table]:
+    """Some row groups of a file, in order. Raises UserError where it is damaged."""
+    try:
+        with pq.ParquetFile(path) as file:
+            for group in range(first, first + number):
+                yield file.read_row_group(group)
+    except DAMAGE as error:
+        raise _damaged(path, error) from None
+
+
 def _locked(path: Path) -> IO[str]:
-    file = path.open("w")
+    try:
+        file = path.open("w")
+    except OSError as error:
+        raise UserError(f"{path.parent}: cannot be written ({_reason(error)})") from None
     try:
         import fcntl
     except ImportError:  # no such lock on this system: two runs at once are the user's affair
@@ -254,12 +296,16 @@ def _locked(path: Path) -> IO[str]:
 
 
 def clear(path: Path) -> None:
-    """Remove a run folder (and nothing else). Raises UserError where it isn't one."""
+    """Remove a run folder (and nothing else). Raises UserError where it isn't one, or in use."""
     if not path.exists():
         return
-    if read_manifest(path) is None and any(p.name != ".lock" for p in path.iterdir()):
+    if read_manifest(path) is None and _holds_something(path):
         raise UserError(f"{path}: this is no run folder, so it isn't cleared; name another")
-    shutil.rmtree(path)
+    _locked(path / LOCK).close()  # nobody is writing it
+    try:
+        shutil.rmtree(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be cleared ({_reason(error)})") from None
 
 
 def read_manifest(path: Path) -> dict[str, Any] | None:
@@ -290,11 +336,9 @@ def read_table(path: Path, name: str) -> pd.DataFrame:
         table: pd.DataFrame = pq.read_table(file).to_pandas()
         return table
     except FileNotFoundError:
-        raise UserError(
-            f"{file}: missing from the run folder; repeat the run with --force"
-        ) from None
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise UserError(f"{file}: cannot be read ({error}); repeat with --force") from None
+        raise _missing(file) from None
+    except DAMAGE as error:
+        raise _damaged(file, error) from None
 
 
 def read_run_sums(
@@ -305,13 +349,21 @@ def read_run_sums(
     Gives by quantity (sums, numbers), each (n_runs,), then the case numbers and the statuses.
     """
     parts: list[pa.Table] = []
-    with pq.ParquetFile(path / "runs.parquet") as file:
-        names = file.schema_arrow.names
-        place = [names.index(name) for name in ("estimator", "window")]
-        for group in range(file.num_row_groups):
-            columns = [file.metadata.row_group(group).column(i).statistics for i in place]
-            if [column.min for column in columns] == [estimator, window]:
-                parts.append(file.read_row_group(group))
+    path = path / "runs.parquet"
+    try:
+        with pq.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            place = [names.index(name) for name in ("estimator", "window")]
+            for group in range(file.num_row_groups):
+                columns = [file.metadata.row_group(group).column(i).statistics for i in place]
+                if [column.min for column in columns] == [estimator, window]:
+                    parts.append(file.read_row_group(group))
+    except FileNotFoundError:
+        raise _missing(path) from None
+    except DAMAGE as error:
+        raise _damaged(path, error) from None
+    if not parts:
+        raise UserError(f"{path}: holds no estimator '{estimator}' with a window '{window}'")
     table = pa.concat_tables(parts)
     quantities = [name.removesuffix("_sum") for name in names if name.endswith("_sum")]
     sums = {q: (_column(table, f"{q}_sum"), _column(table, f"{q}_count")) for q in quantities}

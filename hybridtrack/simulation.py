@@ -68,7 +68,8 @@ def fly(
     """
     state = np.empty((len(times_s), 4))
     mode = np.empty(len(times_s), dtype=np.int64)
-    ends = np.array([leg.until_s for leg in legs])
+    slack_s = 1e-6 * np.diff(times_s).min()  # 3 * 0.1 s still ends a leg that lasts until 0.3 s
+    ends = np.array([leg.until_s for leg in legs]) + slack_s
     index = np.minimum(np.searchsorted(ends, times_s, side="left"), len(legs) - 1)
     position, heading, begin = np.array(position_m, dtype=float), heading_rad, float(times_s[0])
     for number, leg in enumerate(legs):
@@ -188,6 +189,13 @@ def spans(n_steps: int, length: int) -> Iterator[slice]:
         yield slice(begin, min(begin + length, n_steps))
 
 
+def step_lengths(times_s: Array) -> Array:
+    """The lengths of steps (n_steps,), made equal where nothing but rounding tells them apart."""
+    step_s = np.diff(times_s)
+    even = np.ptp(step_s) <= 1e-9 * step_s.mean()
+    return np.full_like(step_s, step_s[0]) if even else step_s
+
+
 class BlockSimulation:
     """Truth and measurements of one block of runs, span by span."""
 
@@ -213,6 +221,7 @@ class BlockSimulation:
             self._mode: Modes = np.searchsorted(cumulative, uniform, side="right")
             self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
             self.initial_state = self._state[:, :lanes].copy()
+            self._step_s = step_lengths(case.times_s)
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
@@ -266,7 +275,7 @@ class BlockSimulation:
         return shaped
 
     def _advance_truth(self, span: slice) -> TruthSpan:
-        truth, times_s = self._case.truth, self._case.times_s
+        truth = self._case.truth
         here = slice(span.start + 1, span.stop + 1)
         if isinstance(truth, FixedTruth):
             return TruthSpan(
@@ -274,7 +283,7 @@ class BlockSimulation:
                 truth.mode[here, np.newaxis],
                 self._since_switch_s[here, np.newaxis],
             )
-        model = truth_model(truth, np.diff(times_s[span.start : span.stop + 1]))
+        model = truth_model(truth, self._step_s[span])
         steps, n_x = span.stop - span.start, len(self.state_names)
         uniform = self._streams[Purpose.MODE_SEQUENCE].random((steps, BLOCK_RUNS))
         modes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
@@ -322,7 +331,8 @@ def two_point_start(
 
     first, second (n_y, lanes) positions; gives the mean (n_x, lanes) at the second scan and its
     covariance (n_x, n_x): R for the position, R/T with it and 2 R/T^2 for the velocity, 0 for an
-    acceleration. Raises UserError where a state is neither position, velocity nor acceleration.
+    acceleration. Raises UserError where a state is neither position, velocity nor acceleration,
+    or where a position or velocity is missing.
     """
     n_x = len(state_names)
     mean = np.zeros((n_x, first.shape[1]))
@@ -332,6 +342,12 @@ def two_point_start(
     if unknown:
         raise UserError(
             f"a start from measurements knows no state '{min(unknown)}'; give initial mean and "
+            "covariance instead"
+        )
+    missing = {prefix + axis for axis in axes for prefix in ("", "v")} - set(state_names)
+    if missing:
+        raise UserError(
+            f"a start from measurements needs the state '{min(missing)}'; give initial mean and "
             "covariance instead"
         )
     for m, axis in enumerate(axes):

@@ -63,6 +63,8 @@ METRICS: Mapping[str, Metric] = {
     ),
 }
 
+ROUNDING = 1e-9  # likelihoods sum to 1; two filters that are one in theory differ by less
+
 QUANTITIES = tuple(dict.fromkeys(metric.quantity for metric in METRICS.values()))
 
 
@@ -88,15 +90,20 @@ class Scores(NamedTuple):
 def squared_error(
     truth: Array, truth_states: tuple[str, ...], estimate: Array, states: tuple[str, ...], kind: str
 ) -> Array | None:
-    """Squared norm of the vector error over the axes that both know; kind '' or 'v'."""
+    """Squared norm of the vector error over the axes that both know; kind '' or 'v'.
+
+    NaN where the estimate isn't finite, infinite where only its square isn't.
+    """
     axes = [kind + axis for axis in "xyz" if kind + axis in truth_states and kind + axis in states]
     if not axes:
         return None
     total = np.zeros((estimate.shape[0], estimate.shape[2]))
     for name in axes:
         difference = estimate[:, states.index(name)] - truth[:, truth_states.index(name)]
-        difference *= difference
-        total += difference
+        difference[np.isinf(difference)] = np.nan
+        with np.errstate(over="ignore"):
+            difference *= difference
+            total += difference
     return total
 
 
@@ -128,7 +135,7 @@ def score(scans: Scans, estimates: Estimates, names: Names) -> Scores:
     score_modes(*arguments, true_mode, out)
     if estimates.mode_likelihoods.shape[0]:
         quantities["likelihood_distinctness"] = out[3]
-    if (true_mode < 0).all():
+    if not set(names.truth_modes) & set(names.modes):
         return Scores(quantities, None)
     quantities["mode_correct"] = out[0]
     quantities["mode_brier"] = out[1]
@@ -192,7 +199,7 @@ def score_modes(probabilities, likelihoods, measurements, true_mode, out):
 
 def advantage_kept(own: Array, reference: Array) -> Array:
     """1 where the true mode leads by at least as much as under the reference, 0 where less."""
-    kept = (own >= reference).astype(np.float64)
+    kept = (own >= reference - ROUNDING).astype(np.float64)
     kept[np.isnan(own) | np.isnan(reference)] = np.nan
     return kept
 

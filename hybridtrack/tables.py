@@ -20,6 +20,7 @@ COLUMNS = (
     ("mode_accuracy", "mode\naccuracy"),
     ("mode_brier", "Brier\nscore"),
 )
+MOST_DECIMALS = 4  # four columns of them fit into 80 characters
 VERDICT_STYLES = {
     "reproduced": "green",
     "reproduced with stated assumptions": "green",
@@ -29,19 +30,14 @@ VERDICT_STYLES = {
 
 
 def figure(value: float, error: float) -> str:
-    """A figure with its standard error, to the error's first digit: '17.94 ± 0.04'.
-
-    An error that begins with 1 has two digits, as is usual: '1.0647 ± 0.0013'.
-    """
+    """A figure with its standard error, to the error's first digit: '17.94 ± 0.04'."""
     if math.isnan(value):
         return ""
     if math.isnan(error):
         return f"{value:.4g}"
     if error == 0.0:
         return f"{value:.4g} ± 0"
-    exponent = math.floor(math.log10(error))
-    digits = 1 if error < 1.95 * 10.0**exponent else 0
-    decimals = min(max(digits - exponent, 0), 6)
+    decimals = min(max(-math.floor(math.log10(error)), 0), MOST_DECIMALS)
     return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
@@ -52,9 +48,11 @@ def show(path: Path, console: Console) -> None:
     runs, cases = manifest["runs"], manifest["cases"]
     over = f" in each of {cases} cases" if cases > 1 else ""
     console.print(f"{manifest['title']}: {runs:,} runs{over}, seed {manifest['seed']}")
+    console.print()
     console.print(_summary(summary, manifest["estimators"]))
     comparisons = results.read_table(path, "comparisons")
     if len(comparisons):
+        console.print()
         console.print(_ratios(comparisons, manifest["compare_with"]))
     for label, count in manifest.get("diverged", {}).items():
         console.print(f"{label}: {count:,} of {runs * cases:,} runs diverged and are left out")
@@ -63,6 +61,7 @@ def show(path: Path, console: Console) -> None:
         console.print(f"windows {', '.join(windows)}: see summary.csv", highlight=False)
     published = results.read_table(path, "published")
     if len(published):
+        console.print()
         console.print(_published(published))
 
 
@@ -103,17 +102,16 @@ def _by_metric(heading: str, labels: list[str], figures: dict[tuple[str, str], s
 
 def _published(published: pd.DataFrame) -> Table:
     table = _plain_table()
-    table.add_column("published claim", ratio=5)
-    table.add_column("published", justify="right")
-    table.add_column("ours", justify="right", no_wrap=True)
-    table.add_column("verdict", ratio=4)
+    table.add_column("verdict", width=18)
+    table.add_column("published claim", ratio=1)
     for row in published.to_dict("records"):
         verdict = Text(row["verdict"], style=VERDICT_STYLES.get(row["verdict"], ""))
         if row["differs"]:
             verdict = Text(f"{row['verdict']} (expected: {row['expected_verdict']})", "bold red")
-        if row["because"]:
-            verdict.append(f": {row['because']}", style="dim")
-        table.add_row(row["claim"], claimed(row), obtained(row), verdict)
+        claim = Text(row["claim"])
+        because = f"; {row['because']}" if row["because"] else ""
+        claim.append(f"\npublished {claimed(row)}, ours {obtained(row)}{because}", style="dim")
+        table.add_row(verdict, claim)
     return table
 
 

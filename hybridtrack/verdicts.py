@@ -4,15 +4,20 @@ A claim is a figure ("IMM position RMS is 18 m") or a comparison ("RMIMM has the
 a metric of a run. A figure is met if ours, give or take K standard errors, lies within what the
 printed digits can mean; a comparison holds if the paired difference has the claimed sign by more
 than K standard errors. Agreement within an error wider than the printed digits decides nothing.
+The error is itself estimated from the runs: where these are few, Student's quantile of the same
+probability stands for K, and one run decides nothing.
 """
 
 import math
 import re
 from typing import Literal, NamedTuple
 
+from scipy.special import stdtrit
+
 from hybridtrack.statistics import Estimate, Paired
 
-K = 3.0  # standard errors allowed: 0.3 % of honest claims miss by more
+K = 3.0  # standard errors allowed: 0.27 % of honest claims miss by more
+ONE_SIDED = 0.5 * math.erfc(K / math.sqrt(2.0))
 
 REPRODUCED = "reproduced"
 ASSUMED = "reproduced with stated assumptions"
@@ -52,7 +57,7 @@ class Outcome(NamedTuple):
 def printed_tolerance(text: str) -> float:
     """Half a unit of the last digit of a number as printed: '18' gives 0.5, '2.10' gives 0.005."""
     match = re.fullmatch(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?", text.strip("'\" "))
-    if match is None:
+    if match is None or not match[1] + match[2]:
         raise ValueError(f"not a printed number: {text!r}")
     return 0.5 * 10.0 ** (int(match[3] or 0) - len(match[2]))
 
@@ -66,13 +71,13 @@ def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
     """The verdict on a comparison; a published ratio is judged too, where there is one."""
     assert claim.sign is not None
     gap = ours.difference.value if claim.sign == "greater" else -ours.difference.value
-    allowed = K * ours.difference.standard_error
+    allowed = _allowed(ours.difference)
     figure = ours.ratio if claim.value is not None else ours.difference
     if gap > allowed:
         verdict = REPRODUCED
         if claim.value is not None:
             met = _figure(claim, ours.ratio, assumptions)
-            verdict = met if met in (REPRODUCED, ASSUMED) else DIRECTION
+            verdict = DIRECTION if met == NOT_REPRODUCED else met
     elif gap < -allowed:
         verdict = NOT_REPRODUCED
     else:
@@ -82,14 +87,19 @@ def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
 
 def _figure(claim: Claim, ours: Estimate, assumptions: bool) -> str:
     assert claim.value is not None
-    if math.isnan(ours.value):
-        return UNDECIDED
-    error = 0.0 if math.isnan(ours.standard_error) else ours.standard_error
-    if abs(ours.value - claim.value) > claim.tolerance + K * error:
+    allowed = _allowed(ours)
+    if abs(ours.value - claim.value) > claim.tolerance + allowed:
         return NOT_REPRODUCED
-    if K * error > claim.tolerance or ours.n_runs < 2:
-        return UNDECIDED
-    return ASSUMED if assumptions else REPRODUCED
+    if allowed <= claim.tolerance:
+        return ASSUMED if assumptions else REPRODUCED
+    return UNDECIDED
+
+
+def _allowed(ours: Estimate) -> float:
+    """What chance may do: K standard errors, more where few runs tell the error; NaN for one."""
+    if ours.n_runs < 2:
+        return math.nan
+    return float(-stdtrit(ours.n_runs - 1, ONE_SIDED)) * ours.standard_error
 
 
 def _outcome(claim: Claim, ours: Estimate, verdict: str) -> Outcome:

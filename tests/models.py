@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hybridtrack.config import load
 from hybridtrack.estimators import _bank
 from hybridtrack.models import JumpMarkovModel, Mode, ModeBank
 
@@ -89,3 +90,69 @@ def unpacked(covariance, n_x):
     full[a, c] = covariance
     full[c, a] = covariance
     return full
+
+
+SMALL = """
+name: small
+clock: {step_s: 1, duration_s: 40}
+truth:
+  start: {position_m: [0, 0], speed_m_s: 200, heading_deg: 30}
+  legs:
+    - {until_s: 14}
+    - {until_s: 25, turn_rate_deg_s: 3, mode: turn}
+    - {until_s: 40}
+sensor: {position_std_m: 20, detection_probability: 0.85}
+modes:
+  straight: {motion: constant_velocity_zero_acceleration, acceleration_std_m_s2: 0.5}
+  turn: {motion: wiener_acceleration, acceleration_std_m_s2: 3}
+transition_matrix: [[0.95, 0.05], [0.15, 0.85]]
+initial:
+  mean: drawn_about_truth
+  position_std_m: 20
+  velocity_std_m_s: 10
+  acceleration_std_m_s2: 0.5
+  mode_probabilities: {straight: 0.8, turn: 0.2}
+estimators:
+  KF: {type: kalman, mode: turn}
+  MMAE: {type: mmae}
+  IMM: {type: imm}
+  RMIMM: {type: rmimm, residual_floor_m: 1}
+compare_with: IMM
+windows:
+  settled: {mode: straight, after_switch_s: 4}
+  onset: {mode: turn, within_switch_s: 3}
+  middle: {from_s: 10, until_s: 33}
+scoring: {skip_scans: 3}
+monte_carlo: {runs: 5, seed: 3, keep_tracks: 2}
+"""
+
+UNEVEN_TIMES_S = np.concatenate([[0.0], np.cumsum(np.tile([0.5, 1.0, 2.5], 13))])
+RANDOM = f"""
+name: random
+dimensions: 1
+clock: {{times_s: [{", ".join(f"{t:g}" for t in UNEVEN_TIMES_S)}]}}
+truth:
+  chain:
+    initial: {{mean: [5, 10], covariance: [[400, 30], [30, 25]]}}
+sensor: {{position_std_m: {{calm: 4, rough: 9}}, detection_probability: 0.8}}
+modes:
+  calm: {{motion: constant_velocity, acceleration_psd_m2_s3: 0.1}}
+  rough: {{motion: constant_velocity, acceleration_psd_m2_s3: 60}}
+mean_sojourn_s: {{calm: 30, rough: 8}}
+initial: {{from_measurements: two_point}}
+estimators:
+  KF: {{type: kalman, mode: rough}}
+  IMM: {{type: imm}}
+compare_with: IMM
+windows:
+  settled: {{mode: calm, after_switch_s: 5}}
+  onset: {{within_switch_s: 4}}
+monte_carlo: {{runs: 5, seed: 8, keep_tracks: 2}}
+"""
+
+
+def scenario(folder, text, *settings):
+    """The experiment of a scenario's text after `key.path=value` settings."""
+    file = folder / "scenario.yaml"
+    file.write_text(text)
+    return load(file, settings)

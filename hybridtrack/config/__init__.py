@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hybridtrack.compiled import PACKAGE
-from hybridtrack.config.build import ChosenEstimator, Experiment, Initial, Window, build
+from hybridtrack.config.build import build
+from hybridtrack.config.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.config.reader import Document, ScenarioError, read
 from hybridtrack.config.schema import json_schema
 from hybridtrack.config.validate import validate

@@ -105,11 +105,11 @@ def _annotation(annotation: Any, limits: tuple[float | None, float | None] | Non
     origin = typing.get_origin(annotation)
     if origin is tuple:
         return list[float]
-    if origin in (types.UnionType, typing.Union):
-        return reduce(lambda a, b: a | b, map(_annotation, typing.get_args(annotation)))
     if limits:
         smallest, largest = limits
         return Annotated[annotation, Field(ge=smallest, le=largest)]
+    if origin in (types.UnionType, typing.Union):
+        return reduce(lambda a, b: a | b, map(_annotation, typing.get_args(annotation)))
     return annotation
 
 
@@ -135,7 +135,9 @@ def _motion_form(name: str) -> type[Form]:
     for parameter in inspect.signature(model.discretise).parameters.values():
         if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
             default = ... if parameter.default is inspect.Parameter.empty else parameter.default
-            fields[parameter.name] = (_annotation(parameter.annotation), default)
+            stem, _ = units.split(parameter.name) or (parameter.name, "")
+            limits = (0.0, None) if stem.endswith(("_std", "_psd")) else None
+            fields[parameter.name] = (_annotation(parameter.annotation, limits), default)
     return create_model(f"mode_{name}", __base__=ModeForm, __doc__=model.summary, **fields)
 
 

@@ -1,0 +1,38 @@
+# `make run` and `make test` work as the first command in a fresh clone.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+# The recorded flight lies inside this package; what it would install besides is not needed.
+FLIGHT = traffic==2.13
+
+.PHONY: run test ordeals check ledger clean
+
+run: $(VENV)/.installed
+	$(BIN)/hybridtrack run configs/rmimm_fig5.yaml
+
+test: $(VENV)/.installed
+	$(BIN)/python -m pytest
+
+ordeals: $(VENV)/.installed
+	$(BIN)/python -m pytest tests/ordeals
+
+check: $(VENV)/.installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+ledger: $(VENV)/.installed
+	$(BIN)/python tests/readme.py
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "hybridtrack needs Python 3.11 or later: make PYTHON=python3.11 ..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(FLIGHT)
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,0 +1,63 @@
+"""What a scenario asks for, in SI and arrays: the frozen Experiment and its parts."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hybridtrack.estimators import BankEstimator
+from hybridtrack.models import Array, ModeBank
+from hybridtrack.simulation import Case, Sensor
+from hybridtrack.verdicts import Claim
+
+
+class Initial(NamedTuple):
+    """How the filters start."""
+
+    two_point: bool  # from the first two scans; what follows is unused then
+    follows_truth: bool  # the mean is the run's true start, plus a draw if `drawn`
+    drawn: bool
+    mean: Array  # (n_x,)
+    covariance: Array  # (n_x, n_x)
+
+
+class Window(NamedTuple):
+    """Steps scored by themselves; every condition that isn't None must hold."""
+
+    name: str
+    from_s: float = -np.inf
+    until_s: float = np.inf
+    mode: int | None = None  # the truth's
+    after_switch_s: float | None = None
+    within_switch_s: float | None = None
+    skip_scans: int = 0
+
+
+class ChosenEstimator(NamedTuple):
+    """An estimator of the scenario: its label there, and how it is set."""
+
+    label: str
+    estimator: BankEstimator
+    settings: Any
+    bank: ModeBank  # what it believes; one mode for a Kalman filter
+
+
+class Experiment(NamedTuple):
+    """What a scenario asks for, in SI and arrays; nothing of YAML is left in it."""
+
+    name: str
+    title: str
+    source: str
+    assumptions: tuple[str, ...]
+    cases: tuple[Case, ...]
+    truth_modes: tuple[str, ...]
+    bank: ModeBank
+    sensor: Sensor
+    initial: Initial
+    estimators: tuple[ChosenEstimator, ...]
+    compare_with: str | None
+    windows: tuple[Window, ...]
+    runs: int
+    seed: int
+    keep_tracks: int
+    claims: tuple[Claim, ...]
+    resolved: dict[str, Any]  # the scenario as it can be run again

@@ -1,0 +1,170 @@
+"""Truth and sensor: the clock, legs flown, chains simulated, recordings read."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hybridtrack.config import banks, checks, recorded, starts
+from hybridtrack.config.reader import Document, Keys
+from hybridtrack.config.schema import ScenarioForm, TruthForm
+from hybridtrack.errors import UserError
+from hybridtrack.models import Array, ModeBank
+from hybridtrack.simulation import Case, ChainTruth, FixedTruth, Leg, Sensor, fly
+
+MAX_STEPS = 10_000_000
+
+
+def cases(
+    form: ScenarioForm, bank: ModeBank, document: Document, folder: Path
+) -> tuple[tuple[str, ...], tuple[Case, ...]]:
+    truth = form.truth
+    kinds = [k for k in ("legs", "chain", "recording") if getattr(truth, k) is not None]
+    if len(kinds) != 1:
+        said = f"both '{kinds[0]}' and '{kinds[1]}'" if kinds else "none of legs, chain, recording"
+        raise document.error(("truth",), f"'truth' has {said}; give one of them")
+    if truth.start is not None and truth.legs is None:
+        raise document.error(("truth", "start"), "'start' belongs to 'legs', which aren't given")
+    if truth.recording is not None:
+        if form.clock is not None:
+            raise document.error(
+                ("clock",), "a recording has times of its own; remove 'clock' (see thin_to_s)"
+            )
+        if form.dimensions != 2:
+            raise document.error(
+                ("dimensions",), "'dimensions' is 1 and a recording has 2; remove it"
+            )
+        try:
+            return (), recorded.cases(truth.recording, folder)
+        except UserError as error:
+            raise document.error(("truth", "recording"), str(error)) from None
+    times_s = _times(form, document)
+    if truth.legs is not None:
+        fixed = _legs(form, truth, times_s, bank.names, document)
+        return bank.names, (Case(form.name, times_s, fixed),)
+    assert truth.chain is not None
+    path: Keys = ("truth", "chain")
+    for name, mode in (truth.chain.modes or {}).items():
+        for key in ("position_std_m", "measurement_noise_covariance", "measurement_matrix"):
+            if getattr(mode, key, None) is not None:
+                raise document.error(
+                    (*path, "modes", name, key),
+                    f"'{key}' has no place in the truth's modes, since the sensor measures; remove "
+                    "it (see 'sensor')",
+                )
+    truth_bank = banks.bank(truth.chain, form, document, path)
+    banks.try_out(truth_bank, [np.diff(times_s)], document, path)
+    start = starts.initial(truth.chain.initial, truth_bank, document, (*path, "initial"))
+    if start.two_point or start.follows_truth:
+        raise document.error(
+            (*path, "initial"), "the truth's own start needs a 'mean' of numbers, one per state"
+        )
+    unknown = set("xy"[: form.dimensions]) - set(truth_bank.state_names)
+    if unknown:
+        raise document.error(
+            path,
+            f"the truth has no state '{min(unknown)}' that could be measured; name its positions "
+            "x (and y) in 'states'",
+        )
+    chain = ChainTruth(truth_bank, start.mean, start.covariance)
+    return truth_bank.names, (Case(form.name, times_s, chain),)
+
+
+def _times(form: ScenarioForm, document: Document) -> Array:
+    clock = form.clock
+    if clock is None:
+        raise document.error((), "'clock' is missing; add it")
+    if clock.times_s is not None:
+        if clock.step_s is not None or clock.duration_s is not None:
+            raise document.error(
+                ("clock", "times_s"),
+                "'times_s' lists every time already; remove 'step_s' and 'duration_s'",
+            )
+        times_s = np.array(clock.times_s, dtype=float)
+        late = np.flatnonzero(np.diff(times_s) <= 0)
+        if late.size:
+            raise document.error(
+                ("clock", "times_s", int(late[0]) + 1),
+                f"'times_s' must increase, and {times_s[late[0] + 1]:g} follows "
+                f"{times_s[late[0]]:g}",
+            )
+        return times_s
+    if clock.step_s is None or clock.duration_s is None:
+        raise document.error(
+            ("clock",), "'clock' needs 'step_s' and 'duration_s', or 'times_s' with every time"
+        )
+    steps = round(clock.duration_s / clock.step_s)
+    if steps < 1 or abs(steps * clock.step_s - clock.duration_s) > 1e-6 * clock.step_s:
+        raise document.error(
+            ("clock", "duration_s"),
+            f"'duration_s' is {clock.duration_s:g} s, no whole number of steps of "
+            f"{clock.step_s:g} s; the nearest is {max(steps, 1) * clock.step_s:g} s",
+        )
+    if steps > MAX_STEPS:
+        raise document.error(
+            ("clock", "duration_s"),
+            f"'duration_s' makes {steps:,} steps of 'step_s', and at most {MAX_STEPS:,} are "
+            "possible; shorten it",
+        )
+    return np.arange(steps + 1, dtype=np.float64) * clock.step_s
+
+
+def _legs(
+    form: ScenarioForm,
+    truth: TruthForm,
+    times_s: Array,
+    modes: tuple[str, ...],
+    document: Document,
+) -> FixedTruth:
+    assert truth.legs is not None
+    if truth.start is None:
+        raise document.error(
+            ("truth",), "'start' is missing in 'truth'; add it: the legs begin there"
+        )
+    if form.dimensions != 2:
+        raise document.error(("dimensions",), "'dimensions' is 1 and legs need 2; remove it")
+    legs: list[Leg] = []
+    speed, end = truth.start.speed_m_s, float(times_s[0])
+    for i, leg in enumerate(truth.legs):
+        path: Keys = ("truth", "legs", i)
+        begin = end if leg.from_s is None else leg.from_s
+        if begin != end:
+            said = "overlaps the one before" if begin < end else "leaves a gap to the one before"
+            raise document.error(
+                (*path, "from_s"),
+                f"the leg {said}, which ends at {end:g} s: 'from_s' is {begin:g} s; leave it out",
+            )
+        if leg.until_s <= end:
+            raise document.error(
+                (*path, "until_s"),
+                f"'until_s' is {leg.until_s:g} s and the leg begins at {end:g} s; let it end later",
+            )
+        mode = modes[0] if leg.mode is None else leg.mode
+        checks.known_mode(mode, modes, document, (*path, "mode"), tuple(form.modes))
+        speed = speed if leg.speed_m_s is None else leg.speed_m_s
+        legs.append(Leg(leg.until_s, leg.turn_rate_rad_s, speed, modes.index(mode)))
+        end = leg.until_s
+    if times_s[-1] - end > 1e-6 * np.diff(times_s).min():
+        raise document.error(
+            ("truth", "legs", len(legs) - 1, "until_s"),
+            f"'until_s' of the last leg is {end:g} s and the clock ends at {times_s[-1]:g} s; fly "
+            "on until then",
+        )
+    x, y = truth.start.position_m
+    return fly(tuple(legs), times_s, (x, y), truth.start.heading_rad)
+
+
+def sensor(
+    form: ScenarioForm, truth_modes: tuple[str, ...], two_point: bool, document: Document
+) -> Sensor:
+    std = form.sensor.position_std_m
+    path: Keys = ("sensor", "position_std_m")
+    if isinstance(std, dict):
+        if not truth_modes:
+            raise document.error(path, "a recording has no modes; give one 'position_std_m'")
+        values = [
+            checks.noise_covariance(v, form.dimensions, document, path)
+            for v in checks.by_mode(std, truth_modes, document, path)
+        ]
+    else:
+        values = [checks.noise_covariance(std, form.dimensions, document, path)]
+    return Sensor(np.stack(values), form.sensor.detection_probability, 2 if two_point else 0)

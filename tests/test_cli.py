@@ -1,0 +1,318 @@
+"""The command line as a user meets it: real processes, real folders."""
+
+import ast
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+SMALL = ["run", "rmimm_fig5", "--runs", "40"]
+
+
+def hybridtrack(*arguments, cwd, **environment):
+    """Run a command; NO_COLOR and COLUMNS as given, no terminal."""
+    return subprocess.run(
+        [sys.executable, "-m", "hybridtrack", *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished small run: the folder where it was started, and what it printed."""
+    cwd = tmp_path_factory.mktemp("finished")
+    return cwd, hybridtrack(*SMALL, cwd=cwd)
+
+
+def one_sentence(done):
+    """The only line on stderr; nothing on stdout, exit code 2."""
+    assert done.returncode == 2
+    assert done.stdout == ""
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "allowed"),
+    # typer itself takes pydantic to read a command's options
+    [(["--help"], set()), (["--version"], set()), (["run", "--help"], {"pydantic"})],
+)
+def test_help_imports_nothing_heavy(arguments, allowed):
+    code = (
+        "import sys\n"
+        f"sys.argv = ['hybridtrack', *{arguments!r}]\n"
+        "from hybridtrack.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'numba', 'pandas', 'matplotlib', 'pydantic', 'scipy', 'pyarrow', 'yaml'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(ast.literal_eval(done.stdout.splitlines()[-1])) <= allowed
+
+
+def test_every_command_has_help_with_examples(tmp_path):
+    from hybridtrack.cli import app
+
+    for command in app.registered_commands:
+        name = command.name or command.callback.__name__
+        done = hybridtrack(name, "--help", cwd=tmp_path)
+        assert done.returncode == 0
+        assert f"  hybridtrack {name}" in done.stdout.partition("Examples:")[2]
+        assert max(map(len, done.stdout.splitlines())) <= 80
+
+
+def test_version_both_ways(tmp_path):
+    from hybridtrack import __version__
+
+    assert hybridtrack("--version", cwd=tmp_path).stdout == f"hybridtrack {__version__}\n"
+    script = Path(sys.executable).parent / "hybridtrack"
+    done = subprocess.run([script, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"hybridtrack {__version__}\n"
+
+
+def test_run_prints_table_verdicts_and_folder_last(finished):
+    cwd, done = finished
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    folder = cwd / lines[-1]
+    assert folder.parent.name == "runs"
+    names = {path.name for path in folder.iterdir()}
+    tables = ("summary", "steps", "runs", "tracks", "published", "comparisons")
+    assert names >= {f"{t}.parquet" for t in tables}
+    assert names >= {"config.yaml", "manifest.json", "summary.csv", "figures"}
+    assert not [name for name in names if name.endswith(".part")]
+    assert {p.stem for p in (folder / "figures").iterdir()} == {
+        "trajectory",
+        "position_error",
+        "velocity_error",
+        "mode_probability",
+        "mode_likelihood",
+    }
+    for label in ("raw", "KF_CV", "KF_CA", "MMAE", "IMM", "RMIMM", "RMIMM_zero"):
+        assert any(line.startswith(label) for line in lines)
+    assert "published claim" in done.stdout
+    assert max(map(len, lines)) <= 80
+    assert "\x1b" not in done.stdout + done.stderr
+    assert json.loads((folder / "manifest.json").read_text())["status"] == "complete"
+
+
+def test_a_complete_run_is_shown_and_force_repeats_it(finished):
+    cwd, first = finished
+    folder = cwd / first.stdout.splitlines()[-1]
+    before = {p: p.stat().st_mtime_ns for p in folder.iterdir() if p.is_file()}
+    again = hybridtrack(*SMALL, cwd=cwd)
+    assert again.stdout == first.stdout
+    assert "complete already" in again.stderr
+    assert before == {p: p.stat().st_mtime_ns for p in folder.iterdir() if p.is_file()}
+    bytes_before = {p.name: p.read_bytes() for p in folder.glob("*.parquet")}
+    forced = hybridtrack(*SMALL, "--force", "--workers", "1", cwd=cwd)
+    assert forced.stdout == first.stdout
+    assert bytes_before == {p.name: p.read_bytes() for p in folder.glob("*.parquet")}
+
+
+def test_json_and_quiet_leave_nothing_else(finished):
+    cwd, _ = finished
+    done = hybridtrack(*SMALL, "--json", "--quiet", cwd=cwd)
+    assert done.stderr == ""
+    data = json.loads(done.stdout)
+    assert data["runs"] == 40
+    rows = {(r["estimator"], r["metric"], r["window"]): r for r in data["summary"]}
+    assert 15 < rows["IMM", "position_rmse_m", "all"]["value"] < 21
+    assert {row["verdict"] for row in data["published"]}
+    assert all(Path(cwd, name).exists() for name in data["figures"])
+
+
+def test_plot_draws_the_same_figures_from_the_folder_alone(finished, tmp_path):
+    cwd, first = finished
+    folder = cwd / first.stdout.splitlines()[-1]
+    figures = {p.name: p.read_bytes() for p in (folder / "figures").iterdir()}
+    for path in (folder / "figures").iterdir():
+        path.unlink()
+    done = hybridtrack("plot", folder, cwd=tmp_path)
+    assert done.returncode == 0
+    assert {Path(line).name for line in done.stdout.splitlines()} == set(figures)
+    assert figures == {p.name: p.read_bytes() for p in (folder / "figures").iterdir()}
+
+
+def test_resolved_configuration_runs_again_to_the_same_digest(finished, tmp_path):
+    cwd, first = finished
+    folder = cwd / first.stdout.splitlines()[-1]
+    done = hybridtrack("run", folder / "config.yaml", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[-1]).name == folder.name
+
+
+def test_out_names_the_folder_and_other_runs_are_safe_in_it(tmp_path):
+    small = ["run", "rmimm_fig5", "--runs", "5", "--quiet"]
+    done = hybridtrack(*small, "--out", "here", cwd=tmp_path)
+    assert done.stdout.splitlines()[-1] == "here"
+    summary = (tmp_path / "here/summary.csv").read_bytes()
+    sentence = one_sentence(hybridtrack(*small, "--seed", "6", "--out", "here", cwd=tmp_path))
+    assert "holds another run" in sentence
+    assert (tmp_path / "here/summary.csv").read_bytes() == summary
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.tex").write_text("x")
+    for force in ([], ["--force"]):
+        one_sentence(hybridtrack(*small, "--out", "mine", *force, cwd=tmp_path))
+    assert (tmp_path / "mine/thesis.tex").read_text() == "x"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "nothing.yaml"], ["nothing.yaml", "no such file"]),
+        (["run", "rmimm_fig6"], ["rmimm_fig6", "rmimm_fig5"]),
+        (["run", "rmimm_fig5", "--runs", "0"], ["monte_carlo.runs=0"]),
+        (["run", "rmimm_fig5", "--set", "monte_carlo.sede=1"], ["sede", "did you mean 'seed'?"]),
+        (["run", "rmimm_fig5", "--set", "foo"], ["foo"]),
+        (["plot", "."], ["run folder"]),
+        (["plot", "nowhere"], ["nowhere"]),
+        (["ledger", "nowhere"], ["nowhere"]),
+        (["init", "a b"], ["a b", "letters"]),
+        (["list", "foo"], ["foo", "estimators"]),
+        (["run", "rmimm_fig5", "--out", "/dev/null/x", "--runs", "2", "-q"], ["/dev/null/x"]),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, arguments, words):
+    sentence = one_sentence(hybridtrack(*arguments, cwd=tmp_path))
+    for word in words:
+        assert word in sentence
+
+
+@pytest.mark.parametrize(
+    "arguments", [["fly"], ["run"], ["run", "rmimm_fig5", "--runs", "many"], ["run", "--what"]]
+)
+def test_wrong_usage_exits_with_2_and_no_traceback(tmp_path, arguments):
+    done = hybridtrack(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "Usage:" in done.stderr
+    assert done.stdout == ""
+
+
+def test_init_validate_and_run_the_starter(tmp_path):
+    done = hybridtrack("init", "first-try", cwd=tmp_path)
+    assert done.stdout == "first-try.yaml\n"
+    assert "no such file" not in done.stderr
+    assert one_sentence(hybridtrack("init", "first-try", cwd=tmp_path)).count("first-try.yaml")
+    valid = hybridtrack("validate", "first-try.yaml", *CONFIGS.glob("*.yaml"), cwd=tmp_path)
+    assert valid.returncode == 0, valid.stderr
+    assert valid.stdout.count(": ok") == 1 + len(list(CONFIGS.glob("*.yaml")))
+    run = hybridtrack("run", "first-try.yaml", "--runs", "40", "--quiet", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "KF_straight" in run.stdout
+
+
+def test_validate_tells_every_file_and_exits_with_2(tmp_path):
+    good = (CONFIGS / "rmimm_fig5.yaml").read_text()
+    (tmp_path / "good.yaml").write_text(good)
+    (tmp_path / "bad.yaml").write_text(good.replace("seed: 5", "sede: 5"))
+    (tmp_path / "empty.yaml").write_text("")
+    done = hybridtrack("validate", "bad.yaml", "good.yaml", "empty.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout.startswith("good.yaml: ok")
+    line = good[: good.index("seed: 5")].count("\n") + 1
+    first, second = done.stderr.splitlines()
+    assert first.startswith(f"error: bad.yaml:{line}:")
+    assert "'sede' is not a key here; did you mean 'seed'?" in first
+    assert second.startswith("error: empty.yaml")
+
+
+def test_list_and_schema(tmp_path):
+    done = hybridtrack("list", cwd=tmp_path)
+    for word in ("rmimm", "wiener_acceleration", "analyses", "mode_brier", "recorded_flight"):
+        assert word in done.stdout
+    only = hybridtrack("list", "motions", cwd=tmp_path).stdout
+    assert "coordinated_turn" in only
+    assert "rmimm" not in only
+    schema = json.loads(hybridtrack("schema", cwd=tmp_path).stdout)
+    assert "monte_carlo" in schema["properties"]
+
+
+def start_long_run(cwd, runs="2000000"):
+    """A run of many minutes, once it has finished its first shard."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hybridtrack", "run", "rmimm_fig5", "--runs", runs, "--out", "long"],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not list(Path(cwd).glob("long/shards/*.npz")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return process
+
+
+def test_interrupt_is_one_line_and_130_and_keeps_what_is_finished(tmp_path):
+    process = start_long_run(tmp_path)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert out == ""
+    assert "Traceback" not in err
+    lines = [line for line in err.splitlines() if "runs," not in line and "compiling" not in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("interrupted; finished shards are kept in long")
+    kept = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "long/shards").glob("*.npz")}
+    assert kept
+    again = start_long_run(tmp_path)  # goes on: the shards that were there stay as they are
+    again.send_signal(signal.SIGINT)
+    again.communicate(timeout=30)
+    now = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "long/shards").glob("*.npz")}
+    assert kept.items() <= now.items()
+
+
+def test_plain_progress_without_a_terminal(tmp_path):
+    process = start_long_run(tmp_path)
+    time.sleep(6)  # a plain line comes every five seconds
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert "of 2,000,000 runs" in err
+    assert "s left" in err
+    assert "\x1b" not in err
+
+
+def test_a_bar_on_a_terminal(tmp_path):
+    """On a pseudo-terminal there is a bar with the count of runs; NO_COLOR has no colours."""
+    import pty
+
+    master, slave = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hybridtrack", "run", "rmimm_fig5", "--runs", "3000"],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=slave,
+        env={**os.environ, "NO_COLOR": "1", "TERM": "xterm", "COLUMNS": "80"},
+    )
+    os.close(slave)
+    shown = b""
+    while True:
+        try:
+            part = os.read(master, 65536)
+        except OSError:
+            break
+        if not part:
+            break
+        shown += part
+    assert process.wait(timeout=120) == 0
+    os.close(master)
+    assert b"/3000" in shown
+    assert b"\x1b[3" not in shown  # no colour
