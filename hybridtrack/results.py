@@ -195,7 +195,7 @@ class RunFolder:
         """The arrays of a shard. Raises UserError where the file is damaged."""
         path = self._shards / f"{name}.npz"
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {key: archive[key] for key in archive.files}
         except DAMAGE as error:
             raise _damaged(path, error) from None

@@ -30,15 +30,15 @@ VERDICT_STYLES = {
 
 
 def figure(value: float, error: float) -> str:
-    """A figure with its standard error, to the error's first digit: '17.94 ± 0.04'."""
+    """A figure with its standard error, to the error's first digit: '17.94±0.04'."""
     if math.isnan(value):
         return ""
     if math.isnan(error):
         return f"{value:.4g}"
     if error == 0.0:
-        return f"{value:.4g} ± 0"
+        return f"{value:.4g}±0"
     decimals = min(max(-math.floor(math.log10(error)), 0), MOST_DECIMALS)
-    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+    return f"{value:.{decimals}f}±{error:.{decimals}f}"
 
 
 def show(path: Path, console: Console) -> None:

@@ -343,9 +343,7 @@ def test_starts_drawn_about_the_truth_have_the_stated_covariance(tmp_path):
     text = SMALL.replace("detection_probability: 0.85", "detection_probability: 1e-6")
     n_x, runs = 6, 256
     covariance = np.zeros((n_x, n_x))
-    for block in (first := [[400, 90], [90, 100]], first):
-        del block
-    covariance[:2, :2] = covariance[3:5, 3:5] = first
+    covariance[:2, :2] = covariance[3:5, 3:5] = [[400, 90], [90, 100]]
     covariance[0, 4] = covariance[4, 0] = 60
     covariance[2, 2] = covariance[5, 5] = 0.25
     spread = "".join(
@@ -437,13 +435,12 @@ clock: {step_s: 1, duration_s: 15}
 states: [x]
 truth: {chain: {initial: {mean: [0]}, modes: {still: {state_transition: [[1]],
   process_noise_covariance: [[1]]}}, transition_matrix: [[1]]}}
-sensor: {position_std_m: {unstable: 1, still: 1}, detection_probability: 1.0e-9}
-modes: {unstable: {state_transition: [[1.0e30]], process_noise_covariance: [[0]],
-  position_std_m: 1}}
+sensor: {position_std_m: 1, detection_probability: 1.0e-9}
+modes: {unstable: {state_transition: [[1.0e30]], process_noise_covariance: [[0]]}}
 initial: {mean: [3], covariance: [[0]]}
 estimators: {KF: {type: kalman, mode: unstable}}
 monte_carlo: {runs: 4, seed: 1}
-""".replace("{unstable: 1, still: 1}", "1")
+"""
     result = block_of(scenario(tmp_path, text), 4)
     assert result.status["KF"].tolist() == [5] * 4  # 3e150
     assert result.steps["KF", "position_squared_error_m2"].n.tolist() == [4] * 4 + [0] * 11

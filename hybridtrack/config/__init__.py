@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hybridtrack.compiled import PACKAGE
 from hybridtrack.config.build import build
+from hybridtrack.config.checks import nearest
 from hybridtrack.config.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.config.reader import Document, ScenarioError, read
 from hybridtrack.config.schema import json_schema
@@ -40,10 +41,9 @@ def find(config: str) -> Path:
     path = Path(config)
     if path.exists() or config not in shipped():
         if not path.exists() and not path.suffix and path.name == config:
-            names = ", ".join(shipped())
             raise ScenarioError(
                 f"{config}: there is no such file, and no scenario of that name is shipped; "
-                f"there are {names}"
+                f"{nearest(config, tuple(shipped()))}"
             )
         return path
     return shipped()[config]

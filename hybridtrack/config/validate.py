@@ -18,6 +18,10 @@ Mistake = Any  # one entry of pydantic's ValidationError.errors()
 
 def validate(document: Document) -> ScenarioForm:
     """The document as a form. Raises ScenarioError about the first mistake in the file."""
+    try:
+        form = ScenarioForm.model_validate(document.data)
+    except ValidationError as error:
+        raise _first_mistake(document, error) from None
     for path, number in _numbers(document.data, ()):
         if number and not SMALLEST <= abs(number) <= LARGEST:
             raise document.error(
@@ -25,10 +29,7 @@ def validate(document: Document) -> ScenarioForm:
                 f"{_label(path)} is {_shown(document, path)}; a number here is 0 or of a size "
                 f"between {SMALLEST:g} and {LARGEST:g}",
             )
-    try:
-        return ScenarioForm.model_validate(document.data)
-    except ValidationError as error:
-        raise _first_mistake(document, error) from None
+    return form
 
 
 def _numbers(value: Any, path: Keys) -> Iterator[tuple[Keys, float]]:
@@ -274,7 +275,7 @@ def _remedy(kind: str, value: Any) -> str:
     """How a scalar of the wrong type is to be written."""
     if kind == "string_type":
         return " (put it in quotes)" if isinstance(value, int | float) else ""
-    if isinstance(value, float) and value.is_integer():
+    if kind.startswith("int") and isinstance(value, float) and value.is_integer():
         return f", written {value:.0f}"
     quoted = isinstance(value, str) and value.lstrip("+-").replace(".", "", 1).isdecimal()
     return " (without quotes)" if quoted and kind in ("int_type", "float_type") else ""

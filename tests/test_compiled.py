@@ -1,0 +1,91 @@
+"""The kernels' elementary functions, their cache, and life without compilation."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridtrack import compiled
+from hybridtrack.compiled import exp, kernel, log
+
+
+@kernel
+def exp_of(x, out):
+    for b in range(x.size):
+        out[b] = exp(x[b])
+
+
+@kernel
+def log_of(x, out):
+    for b in range(x.size):
+        out[b] = log(x[b])
+
+
+def applied(function, x):
+    out = np.empty_like(x)
+    function(x, out)
+    return out
+
+
+def test_exp_is_good_to_two_units_in_the_last_place():
+    rng = np.random.default_rng(1)
+    x = np.concatenate([-707.9 * rng.random(20000), -(10.0 ** rng.uniform(-20, 0, 2000)), [0.0]])
+    np.testing.assert_allclose(applied(exp_of, x), np.exp(x), rtol=5e-16)
+
+
+def test_exp_at_its_ends():
+    x = np.array([0.0, -708.1, -1e6, -np.inf, np.nan])
+    np.testing.assert_array_equal(applied(exp_of, x), [1.0, 0.0, 0.0, 0.0, np.nan])
+
+
+def test_log_is_good_to_two_units_in_the_last_place():
+    rng = np.random.default_rng(2)
+    x = np.concatenate([10.0 ** rng.uniform(-307, 307, 20000), 1 + rng.uniform(-1, 1, 2000) / 1e6])
+    np.testing.assert_allclose(applied(log_of, x), np.log(x), rtol=5e-16)
+
+
+def test_log_at_its_ends():
+    x = np.array([0.0, 1.0, 5e-324, 1e-310, -1.0, np.nan])
+    with np.errstate(all="ignore"):
+        np.testing.assert_allclose(applied(log_of, x), np.log(x), rtol=5e-16)
+
+
+def test_cache_folder_is_named_by_the_sources():
+    code = "import hybridtrack.compiled as c, os; print(os.environ['NUMBA_CACHE_DIR'])"
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip().endswith(f"kernels-{compiled.source_digest()}")
+
+
+def test_an_unwritable_home_falls_back_to_a_temporary_folder(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    code = "import hybridtrack.compiled as c; print(c.os.environ['NUMBA_CACHE_DIR'])"
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment | {"XDG_CACHE_HOME": str(blocked)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "hybridtrack-kernels-" in done.stdout
+
+
+@pytest.mark.parametrize("file", ["test_bank.py"])
+def test_small_cases_run_without_compilation(file):
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", Path(__file__).parent / file, "-k"]
+        + ["reference or spans or hand or unreachable"],
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    assert "passed" in done.stdout

@@ -1,0 +1,344 @@
+"""The run folder: whole or not at all, one writer, and one sentence for whatever is wrong."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from models import SMALL, scenario
+
+from hybridtrack.errors import UserError
+from hybridtrack.experiment import paired, run
+from hybridtrack.results import (
+    SCHEMAS,
+    RunFolder,
+    clear,
+    read_manifest,
+    read_run_sums,
+    read_table,
+    replacing,
+    require_complete,
+    write_text,
+)
+
+
+def quiet(done, total):
+    """A report that says nothing."""
+
+
+def sentence(caught):
+    """The message, if it is one line that ends in no traceback."""
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A small experiment and its finished run's folder, for tests that only read it."""
+    folder = tmp_path_factory.mktemp("finished")
+    experiment = scenario(folder, SMALL)
+    run(experiment, folder / "run", 1, quiet)
+    return experiment, folder / "run"
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """The same, for tests that damage it."""
+    experiment = scenario(tmp_path, SMALL)
+    run(experiment, tmp_path / "run", 1, quiet)
+    return experiment, tmp_path / "run"
+
+
+# ---- whole or not at all ---------------------------------------------------------------------
+
+
+def fail_halfway(path, error):
+    with replacing(path) as temporary:
+        temporary.write_text("half of the n")
+        raise error
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    file = tmp_path / "summary.csv"
+    write_text(file, "old")
+    with pytest.raises(error):
+        fail_halfway(file, error())
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.csv"]
+    assert file.read_text() == "old"
+
+
+def test_a_full_disk_is_one_sentence(tmp_path):
+    with pytest.raises(UserError) as caught:
+        fail_halfway(tmp_path / "a", OSError(28, "No space left on device"))
+    assert sentence(caught).endswith("a: cannot be written (no space left on device)")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_written_anew_replaces_the_old_one(tmp_path):
+    write_text(tmp_path / "a", "old")
+    write_text(tmp_path / "a", "new\n")
+    assert (tmp_path / "a").read_bytes() == b"new\n"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+# ---- one writer, one run ---------------------------------------------------------------------
+
+HOLDS_IT = """
+import sys
+from pathlib import Path
+from hybridtrack.results import RunFolder
+with RunFolder(Path(sys.argv[1]), "d1"):
+    print("mine", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_process_is_told_to_wait(tmp_path):
+    pytest.importorskip("fcntl", reason="no such locks here")
+    folder = tmp_path / "run"
+    arguments = [sys.executable, "-c", HOLDS_IT, str(folder)]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b"mine\n"
+        with pytest.raises(UserError, match="another run is writing this folder") as caught:
+            RunFolder(folder, "d1").__enter__()
+        sentence(caught)
+        with pytest.raises(UserError, match="another run is writing this folder"):
+            clear(folder)  # --force while it runs
+        assert folder.exists()
+        first.stdin.close()
+    with RunFolder(folder, "d1"):  # free again
+        pass
+
+
+def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / ".manifest.json.123.part").write_text("{")  # killed at its very first file
+    with RunFolder(folder, "d1"):
+        assert [path.name for path in folder.iterdir()] == [".lock"]
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match="holds something else; name another with --out") as caught:
+        RunFolder(tmp_path, "d1")
+    sentence(caught)
+    with pytest.raises(UserError, match="no run folder, so it isn't cleared") as caught:
+        clear(tmp_path)
+    sentence(caught)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_folder_with_another_run_is_left_alone(finished):
+    experiment, folder = finished
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    other = experiment._replace(resolved={**experiment.resolved, "name": "other"})
+    with pytest.raises(UserError, match=r"holds another run \(small, digest \w+\)") as caught:
+        run(other, folder, 1, quiet)
+    assert "--out" in sentence(caught)
+    assert "--force" in sentence(caught)
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(UserError, match="cannot be made") as caught:
+            RunFolder(path, "d1")
+        sentence(caught)
+
+
+def test_clear_removes_run_folders_finished_or_begun(damaged, tmp_path):
+    _, folder = damaged
+    clear(folder)
+    assert not folder.exists()
+    clear(folder)  # nothing there: nothing to do
+    with RunFolder(tmp_path / "begun", "d1"):
+        pass
+    clear(tmp_path / "begun")
+    assert not (tmp_path / "begun").exists()
+
+
+# ---- damage ----------------------------------------------------------------------------------
+
+
+def cut(path, keep):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data))])
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"status": ', "\xff\xfe"])
+def test_a_damaged_manifest_is_one_sentence(damaged, text):
+    experiment, folder = damaged
+    (folder / "manifest.json").write_text(text, encoding="latin-1")
+    for use in (
+        lambda: run(experiment, folder, 1, quiet),
+        lambda: require_complete(folder),
+        lambda: clear(folder),
+    ):
+        with pytest.raises(UserError, match=r"manifest.json: cannot be read .*; remove") as caught:
+            use()
+        sentence(caught)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
+def test_a_damaged_shard_is_one_sentence(damaged, keep):
+    experiment, folder = damaged
+    (shard,) = (folder / "shards").glob("*.npz")
+    cut(shard, keep)
+    with pytest.raises(UserError, match=r"npz: this file is damaged .*--force") as caught:
+        run(experiment, folder, 1, quiet)
+    sentence(caught)
+
+
+def test_a_shard_with_a_flipped_bit_is_noticed(damaged):
+    experiment, folder = damaged
+    (shard,) = (folder / "shards").glob("*.npz")
+    data = bytearray(shard.read_bytes())
+    data[len(data) // 2] ^= 1
+    shard.write_bytes(data)
+    with pytest.raises(UserError, match="this file is damaged"):
+        run(experiment, folder, 1, quiet)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
+def test_truncated_tables_are_one_sentence(damaged, keep):
+    experiment, folder = damaged
+    for name in ("summary", "runs"):
+        cut(folder / f"{name}.parquet", keep)
+    for use in (
+        lambda: read_table(folder, "summary"),
+        lambda: read_run_sums(folder, "IMM", "all"),
+        lambda: paired(folder, "IMM", "KF", "position_rmse_m", "all"),
+        lambda: run(experiment, folder, 1, quiet),
+    ):
+        with pytest.raises(UserError, match=r"parquet: this file is damaged .*--force") as caught:
+            use()
+        sentence(caught)
+
+
+def test_a_truncated_part_of_runs_is_one_sentence(tmp_path):
+    cells = [pa.table({"estimator": ["IMM"] * 9, "window": ["all"] * 9})]
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        folder.save_shard("s", {"steps": np.zeros(3)}, cells)
+        cut(tmp_path / "run" / "shards" / "s.parquet", 0.5)
+        with pytest.raises(UserError, match=r"s.parquet: this file is damaged") as caught:
+            folder.assemble_runs(["s"], 1)
+        sentence(caught)
+    assert not (tmp_path / "run" / "runs.parquet").exists()
+
+
+def test_a_missing_table_is_one_sentence(damaged):
+    _, folder = damaged
+    for name in ("steps", "runs"):
+        (folder / f"{name}.parquet").unlink()
+    for use in (lambda: read_table(folder, "steps"), lambda: read_run_sums(folder, "IMM", "all")):
+        with pytest.raises(UserError, match=r"missing from the run folder; .*--force") as caught:
+            use()
+        sentence(caught)
+
+
+def test_lost_runs_are_run_again(damaged):
+    """Statistics are of no use without their runs."""
+    experiment, folder = damaged
+    before = (folder / "runs.parquet").read_bytes()
+    (folder / "runs.parquet").unlink()
+    run(experiment, folder, 1, quiet)
+    assert (folder / "runs.parquet").read_bytes() == before
+
+
+# ---- shards ----------------------------------------------------------------------------------
+
+
+def cells(shard, labels=("raw", "IMM")):
+    return [
+        pa.table({"estimator": [label] * 2, "window": ["all"] * 2, "run": [shard, shard + 1]})
+        for label in labels
+    ]
+
+
+def test_a_shard_comes_back_as_it_was_put_away(tmp_path):
+    arrays = {"keys": np.array('{"a": 1}'), "steps": np.array([[np.nan, np.inf, 1e-320]])}
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        assert not folder.has_shard("0")
+        folder.save_shard("0", arrays, cells(0))
+        assert folder.has_shard("0")
+        loaded = folder.load_shard("0")
+    assert str(loaded["keys"]) == '{"a": 1}'
+    assert loaded["steps"].tobytes() == arrays["steps"].tobytes()
+
+
+def test_runs_are_assembled_in_the_order_asked_for_from_old_and_new(tmp_path):
+    runs = tmp_path / "run" / "runs.parquet"
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        for number in (0, 10):
+            folder.save_shard(str(number), {"a": np.zeros(1)}, cells(number))
+        folder.write_manifest({"digest": "d1"})
+        folder.assemble_runs(["0", "10"], 2)
+        folder.drop_parts(["0", "10"])
+    assert pq.read_table(runs)["run"].to_pylist() == [0, 1, 0, 1, 10, 11, 10, 11]
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        assert folder.has_shard("10")
+        folder.save_shard("5", {"a": np.zeros(1)}, cells(5))
+        folder.assemble_runs(["5", "10"], 2)
+        folder.drop_parts(["5", "10"])
+        assert not folder.has_shard("0")
+    table = pq.read_table(runs)
+    assert table["run"].to_pylist() == [5, 6, 5, 6, 10, 11, 10, 11]
+    assert table["estimator"].to_pylist() == ["raw", "raw", "IMM", "IMM"] * 2
+    assert sorted(p.name for p in (tmp_path / "run" / "shards").iterdir()) == ["10.npz", "5.npz"]
+
+
+# ---- reading ---------------------------------------------------------------------------------
+
+
+def test_require_complete(finished, tmp_path):
+    _, folder = finished
+    assert require_complete(folder) == json.loads((folder / "manifest.json").read_text())
+    for path in (tmp_path, tmp_path / "nothing", folder / "config.yaml"):
+        with pytest.raises(UserError, match="this is no run folder; name one that") as caught:
+            require_complete(path)
+        sentence(caught)
+    (tmp_path / "manifest.json").write_text('{"status": "running"}')
+    with pytest.raises(UserError, match="isn't complete; run its scenario again"):
+        require_complete(tmp_path)
+    assert read_manifest(tmp_path / "nothing") is None
+
+
+def test_run_sums_are_the_rows_of_one_estimator_and_window(finished):
+    experiment, folder = finished
+    table = pd.read_parquet(folder / "runs.parquet")
+    for label in ("raw", "IMM", "RMIMM"):
+        for window in experiment.windows:
+            sums, case, status = read_run_sums(folder, label, window.name)
+            mine = table[(table["estimator"] == label) & (table["window"] == window.name)]
+            np.testing.assert_array_equal(case, mine["case_number"])
+            np.testing.assert_array_equal(status, mine["status"])
+            assert len(mine) == experiment.runs
+            for quantity, (total, number) in sums.items():
+                np.testing.assert_array_equal(total, mine[f"{quantity}_sum"])
+                np.testing.assert_array_equal(number, mine[f"{quantity}_count"])
+
+
+@pytest.mark.parametrize(("estimator", "window"), [("XYZ", "all"), ("IMM", "xyz")])
+def test_run_sums_that_are_not_there_are_one_sentence(finished, estimator, window):
+    with pytest.raises(UserError, match="holds no estimator") as caught:
+        read_run_sums(finished[1], estimator, window)
+    assert estimator in sentence(caught)
+    assert window in sentence(caught)
+
+
+def test_tables_have_their_schema_even_when_empty(tmp_path):
+    names = SCHEMAS["published"].names
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        folder.write_table("published", {name: [] for name in names})
+    table = read_table(tmp_path / "run", "published")
+    assert list(table.columns) == names
+    assert table.empty
+    assert table["ours"].dtype == np.float64
