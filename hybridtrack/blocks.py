@@ -18,6 +18,7 @@ from hybridtrack.simulation import (
     TruthSpan,
     spans,
     square_root,
+    step_lengths,
     two_point_start,
 )
 from hybridtrack.statistics import (
@@ -137,9 +138,8 @@ class _Block:
             task.block,
             self._lanes,
         )
-        step_s = np.diff(self._case.times_s)
-        self._even = np.ptp(step_s) <= 1e-9 * step_s.mean()
-        self._even_step_s = step_s[:1]
+        self._step_s = step_lengths(self._case.times_s)
+        self._even = bool((self._step_s == self._step_s[0]).all())
         self._running: dict[str, Running] = {}
         self._steps: dict[Series, Moments] = {}
         self._sums: dict[Cell, tuple[Array, Array]] = {}
@@ -180,7 +180,7 @@ class _Block:
                 noise = self._simulation.initial_estimate_noise(len(states))
                 mean += square_root(covariance) @ noise
         self._initial_covariance = covariance
-        self._even_models = self._models(self._even_step_s)
+        self._even_models = self._models(self._step_s[:1])
         for chosen in experiment.estimators:
             model = self._even_models[chosen.label]
             self._running[chosen.label] = Running(chosen.estimator, chosen.settings, model, mean)
@@ -212,7 +212,7 @@ class _Block:
         models = self._even_models
         skipped = max(self._first_step - span.start, 0)  # scans used up by a two-point start
         if not self._even:
-            models = self._models(np.diff(self._case.times_s[span.start + skipped : span.stop + 1]))
+            models = self._models(self._step_s[span.start + skipped : span.stop])
         advantages: dict[str, Array] = {}
         for label, running in self._running.items():
             estimates = running.advance(

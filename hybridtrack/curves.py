@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MOST_CASES = 6
+MOST_POINTS = 500  # of a curve; a page has no room for more
 GAP_IN_MEDIAN_STEPS = 5.0
 
 
 class Curve(NamedTuple):
-    """One metric of one estimator over time, each (n_steps,); time in s, NaN where unknown."""
+    """One metric of one estimator over time, each (n_points,); time in s, NaN where unknown."""
 
     time: Array
     value: Array
     standard_error: Array
+    pooled: int = 1  # steps to a point
 
 
 class Truth(NamedTuple):
@@ -71,10 +73,41 @@ def read_curves(table: pd.DataFrame, metric: str, names: Iterable[str]) -> dict[
     curves = {}
     for name in names:
         rows = chosen[chosen["estimator"] == name]
-        curve = Curve(*(as_numbers(rows[c]) for c in ("time_s", "value", "standard_error")))
+        time, value, error = (as_numbers(rows[c]) for c in ("time_s", "value", "standard_error"))
+        curve = Curve(time, value, error)
         if np.isfinite(curve.value).any():
-            curves[name] = curve
+            curves[name] = pooled(curve, "_rmse_" in metric)
     return curves
+
+
+def pooled(curve: Curve, root: bool) -> Curve:
+    """At most MOST_POINTS points: the mean, or root mean square, over groups of steps.
+
+    The standard error is the steps' mean one, as if they erred together: rather too wide.
+    """
+    size = -(-len(curve.time) // MOST_POINTS)
+    if size <= 1:
+        return curve
+    power = 2.0 if root else 1.0
+    segments = np.split(np.arange(len(curve.time)), gaps(curve.time))
+    table = pd.DataFrame(
+        {"time": curve.time, "value": curve.value**power, "error": curve.standard_error}
+    )
+    parts = []
+    for segment in segments:  # no point pools what lies on both sides of a gap
+        part = table.iloc[segment].groupby(np.arange(len(segment)) // size).mean()
+        parts += [part, pd.DataFrame({name: [np.nan] for name in table})]
+    points = pd.concat(parts[:-1])
+    time, value, error = (points[name].to_numpy(np.float64) for name in table)
+    return Curve(time, value ** (1.0 / power), error, size)
+
+
+def gaps(time: Array) -> Any:
+    """Indices of the steps before which the time jumps."""
+    if len(time) < 2:
+        return np.empty(0, dtype=np.intp)
+    jumps = np.diff(time)
+    return np.flatnonzero(jumps > GAP_IN_MEDIAN_STEPS * np.median(jumps)) + 1
 
 
 def mode_names(table: pd.DataFrame, metric: str) -> tuple[str, ...]:
@@ -108,11 +141,8 @@ def switch_times(truth: Truth | None) -> Array:
 
 def broken_at_gaps(time: Array, *columns: Array) -> list[Array]:
     """The same columns with a NaN put in wherever the time jumps: no line crosses a gap."""
-    if len(time) < 2:
-        return [time, *columns]
-    jumps = np.diff(time)
-    gaps = np.flatnonzero(jumps > GAP_IN_MEDIAN_STEPS * np.median(jumps)) + 1
-    return [np.insert(column, gaps, np.nan) for column in (time, *columns)]
+    places = gaps(time)
+    return [np.insert(column, places, np.nan) for column in (time, *columns)]
 
 
 def read_paths(one: pd.DataFrame, plane: bool) -> dict[str, Array]:

@@ -66,9 +66,12 @@ def digest(experiment: Experiment) -> str:
     """What a run folder is named by: the scenario without `runs`, its recordings, our sources."""
     resolved = json.loads(json.dumps(experiment.resolved))
     del resolved["monte_carlo"]["runs"]
+    recording = resolved["truth"].get("recording", {})
+    for holder in (recording, recording.get("reference", {})):
+        holder.pop("file", None)  # what was recorded counts, not where the file lies
     hashed = hashlib.sha256(json.dumps(resolved, sort_keys=True).encode())
     hashed.update(source_digest().encode())
-    if "recording" in resolved["truth"]:
+    if recording:
         for case in experiment.cases:
             for array in (case.times_s, *case.truth[:1], case.recorded):
                 if isinstance(array, np.ndarray):

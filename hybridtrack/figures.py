@@ -316,13 +316,17 @@ def _scale_error(ax: Axes, values: Mapping[str, Array]) -> list[str]:
 
 
 def _over(curves: Iterable[Curve], runs: int) -> str:
+    curves = list(curves)
     bands = any(np.isfinite(curve.standard_error).any() for curve in curves)
-    return f"over {runs:,} run{'s' * (runs != 1)}" + "; bands: ±2 standard errors" * bands
+    steps = max(curve.pooled for curve in curves)
+    said = f"over {runs:,} run{'s' * (runs != 1)}"
+    said += f" and {steps} steps a point" * (steps > 1)
+    return said + "; bands: ±2 standard errors" * bands
 
 
 def _plot_curve(ax: Axes, curve: Curve, look: Look) -> None:
     """The curve and its band of two standard errors on either side."""
-    time, value, error = broken_at_gaps(*curve)
+    time, value, error = broken_at_gaps(curve.time, curve.value, curve.standard_error)
     _plot_line(ax, time, value, look)
     low, high = value - 2 * error, value + 2 * error
     ax.fill_between(time, low, high, color=look.colour, alpha=0.2, linewidth=0)

@@ -192,7 +192,8 @@ def spans(n_steps: int, length: int) -> Iterator[slice]:
 def step_lengths(times_s: Array) -> Array:
     """The lengths of steps (n_steps,), made equal where nothing but rounding tells them apart."""
     step_s = np.diff(times_s)
-    even = np.ptp(step_s) <= 1e-9 * step_s.mean()
+    rounding = 4 * np.finfo(np.float64).eps * np.abs(times_s).max()
+    even = np.ptp(step_s) <= 1e-9 * step_s.mean() + rounding
     return np.full_like(step_s, step_s[0]) if even else step_s
 
 

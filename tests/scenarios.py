@@ -41,10 +41,10 @@ windows: {late: {from_s: 2, until_s: 4}}
 monte_carlo: {runs: 10, seed: 1}
 """
 
-Path_ = tuple[str | int, ...]
+Keys = tuple[str | int, ...]
 
 
-def paths(value: Any, here: Path_ = ()) -> list[Path_]:
+def paths(value: Any, here: Keys = ()) -> list[Keys]:
     """The path of every value inside a document."""
     if isinstance(value, dict):
         parts: list[tuple[str | int, Any]] = list(value.items())
@@ -92,7 +92,7 @@ def mutations(draw: st.DrawFn, original: dict[str, Any]) -> dict[str, Any]:
         path = draw(st.sampled_from(places)) if places else None
         if path is None:
             break
-        holder = data
+        holder: Any = data
         for key in path[:-1]:
             holder = holder[key]
         key = path[-1]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from models import figure_5_model, random_model, run_kernel, unpacked
 
 import reference
 from hybridtrack.estimators import _bank
@@ -18,6 +17,7 @@ from hybridtrack.estimators._bank import (
     RESIDUAL_MEAN,
     Recursion,
 )
+from models import figure_5_model, random_model, run_kernel, unpacked
 
 ROUNDING = 1e-10  # relative: about 1e-16 per operation, some 1e4 operations, a margin of 100
 

@@ -4,9 +4,8 @@ import threading
 
 import numpy as np
 import pytest
-import reference
-from models import RANDOM, SMALL, scenario
 
+import reference
 from hybridtrack import blocks
 from hybridtrack.blocks import (
     RAW,
@@ -27,6 +26,7 @@ from hybridtrack.simulation import (
     square_root,
     stream,
 )
+from models import RANDOM, SMALL, scenario
 
 # The kernels and the reference order their operations differently: 1e-10 per filter (test_bank),
 # and a factor ten for what squares and sums make of it.

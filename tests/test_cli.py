@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 CONFIGS = Path(__file__).parent.parent / "configs"
+HEAVY = {"numpy", "numba", "pandas", "matplotlib", "pydantic", "scipy", "pyarrow", "yaml"}
 SMALL = ["run", "rmimm_fig5", "--runs", "40"]
 
 
@@ -58,8 +59,7 @@ def test_help_imports_nothing_heavy(arguments, allowed):
         "from hybridtrack.cli import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        "heavy = {'numpy', 'numba', 'pandas', 'matplotlib', 'pydantic', 'scipy', 'pyarrow', 'yaml'}\n"
-        "print(sorted(heavy & set(sys.modules)))\n"
+        f"print(sorted({HEAVY!r} & set(sys.modules)))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert set(ast.literal_eval(done.stdout.splitlines()[-1])) <= allowed

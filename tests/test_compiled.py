@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from hybridtrack import compiled
 from hybridtrack.compiled import exp, kernel, log
@@ -77,11 +76,10 @@ def test_an_unwritable_home_falls_back_to_a_temporary_folder(tmp_path):
     assert "hybridtrack-kernels-" in done.stdout
 
 
-@pytest.mark.parametrize("file", ["test_bank.py"])
-def test_small_cases_run_without_compilation(file):
+def test_small_cases_run_without_compilation():
+    chosen = ["-k", "reference or spans or hand or unreachable"]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", Path(__file__).parent / file, "-k"]
-        + ["reference or spans or hand or unreachable"],
+        [sys.executable, "-m", "pytest", Path(__file__).parent / "test_bank.py", *chosen],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         text=True,

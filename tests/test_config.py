@@ -1,7 +1,7 @@
 """The config room under bad input and good: in which words it refuses, and what it understands."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from hybridtrack.config import Experiment, dump, json_schema, load, shipped
+from hybridtrack.config.reader import read
+from hybridtrack.errors import UserError
+from hybridtrack.experiment import digest
+from hybridtrack.simulation import ChainTruth, FixedTruth
 from scenarios import (
     CHAIN,
     FIG5,
@@ -18,12 +24,6 @@ from scenarios import (
     mutations,
     scenario_data,
 )
-
-from hybridtrack.config import Experiment, dump, json_schema, load, shipped
-from hybridtrack.config.reader import read
-from hybridtrack.errors import UserError
-from hybridtrack.experiment import digest
-from hybridtrack.simulation import ChainTruth, FixedTruth
 
 # An edit replaces the first text by the second, in which » stands before the place of the error
 # (its line and column are exact then, however the shipped scenario is laid out) and is left out.
@@ -67,7 +67,7 @@ UNKNOWN_KEYS: list[tuple[Edit, str]] = [
     ((NAME, "»nmae: rmimm_fig5"), "'nmae' is not a key here; did you mean 'name'?"),
     ((NAME, f"»banana: 1\n{NAME}"), "'banana' is not a key here; the keys are assumptions, clock"),
     (("seed: 5", "»sede: 5"), "'sede' is not a key here; did you mean 'seed'?"),
-    ((CV, CV.replace("accel", "»acel")), "did you mean 'acceleration_std_m_s2'?"),
+    ((CV, CV.replace(", accel", ", »acel")), "did you mean 'acceleration_std_m_s2'?"),
     (
         (CV, CV.replace("}", ", »jerk_psd_m2_s5: 3}")),
         "the keys are acceleration_psd_m2_s3, acceleration_std_m_s2, motion, position_std_m",
@@ -154,7 +154,10 @@ LIMITS: list[tuple[Edit, str]] = [
     ((NOISE, "position_std_m: 1, »detection_probability: 1.5}"), "is 1.5; it must be at most 1"),
     ((NOISE, "position_std_m: 1, »detection_probability: 0}"), "is 0; it must be greater than 0"),
     (("step_s: 1,", "»step_s: 0,"), "'step_s' is 0; it must be greater than 0"),
-    ((CV, CV.replace("accel", "»accel").replace("0.2", "-0.2")), "is -0.2; it must be at least 0"),
+    (
+        (CV, CV.replace(", accel", ", »accel").replace("0.2", "-0.2")),
+        "is -0.2; it must be at least 0",
+    ),
     (("velocity_std_m_s: 10", "»velocity_std_m_s: -10"), "is -10; it must be at least 0"),
     (("{until_s: 30}", "{until_s: 30, »speed_kt: -5}"), "'speed_kt' is -5; it must be at least 0"),
     ((FLOOR, FLOOR.replace("residual", "»residual").replace("1.0", "0")), "must be greater than 0"),
@@ -215,7 +218,10 @@ MISSING: list[tuple[list[Edit], str]] = [
     ([("KF_CV: {type: kalman, mode: CV}", "»KF_CV: {type: kalman}")], "'mode' is missing in 'KF_"),
     ([(CT, "»CT: {motion: coordinated_turn}")], "'turn_rate_rad_s' (or turn_rate_deg_s) is missi"),
     ([(CT, "»CT: {motion: wiener_acceleration}")], "give exactly one of acceleration_std_m_s2 and"),
-    ([("{until_s: 70}", "»{}")], "'until_s' (or until_min, until_h) is missing in item 3 of 'legs'"),
+    (
+        [("{until_s: 70}", "»{}")],
+        "'until_s' (or until_min, until_h) is missing in item 3 of 'legs'",
+    ),
     ([(START, "»start: {speed_kt: 480}")], "'heading_rad' (or heading_deg) is missing in 'start'"),
     ([("truth:  ", "»truth:  "), (START, "")], "'start' is missing in 'truth'; add it: the legs"),
     ([("initial:\n", "»initial:\n"), (MEAN, "")], "'mean' is missing; add truth, drawn_about_trut"),
@@ -224,13 +230,22 @@ MISSING: list[tuple[list[Edit], str]] = [
         [("initial:\n", "»initial:\n"), ("  acceleration_std_m_s2: 0.001\n", "")],
         "the spread of state 'ax' is missing; add 'acceleration_std_m_s2'",
     ),
-    ([(f"{CV}\n", ""), (CT, ""), ("modes:\n", "»modes: {}")], "'modes' has no entries; give at lea"),
-    ([("- claim: IMM position RMS error is 18 m\n    est", "- »est")], "'claim' is missing in item"),
+    (
+        [(f"{CV}\n", ""), (CT, ""), ("modes:\n", "»modes: {}")],
+        "'modes' has no entries; give at lea",
+    ),
+    (
+        [("- claim: IMM position RMS error is 18 m\n    est", "- »est")],
+        "'claim' is missing in item",
+    ),
 ]
 
 FIT: list[tuple[Edit, str]] = [
     # the clock
-    (("step_s: 1, d", "step_s: 0.7, »d"), "no whole number of steps of 0.7 s; the nearest is 149.8"),
+    (
+        ("step_s: 1, d", "step_s: 0.7, »d"),
+        "no whole number of steps of 0.7 s; the nearest is 149.8",
+    ),
     (("step_s: 1, d", "step_s: 1e-9, »d"), "makes 150,000,000,000 steps of 'step_s', and at most"),
     ((SPAN, "times_s: [0, 1, »1]"), "'times_s' must increase, and 1 follows 1"),
     ((SPAN, "step_s: 1, »times_s: [0, 150]"), "remove 'step_s' and 'duration_s'"),
@@ -253,10 +268,22 @@ FIT: list[tuple[Edit, str]] = [
     (("-3.0, mode: CT}", "-3.0, »mode: ct}"), "mode 'ct' is not defined; did you mean 'CT'?"),
     (("kalman, mode: CV", "kalman, »mode: X"), "mode 'X' is not defined; there are CV, CT"),
     ((WINDOW, WINDOW.replace("mode: CV", "»mode: X")), "mode 'X' is not defined; there are CV, CT"),
-    ((PROBABILITIES, "mode_probabilities: {CV: 0.9, »X: 0.1}"), "mode 'X' is not defined; there ar"),
-    ((MATRIX, "mean_sojourn_s: {CV: 20, CT: 20, »X: 1}"), "mode 'X' is not defined; there are CV, "),
-    ((NOISE, "position_std_m: {CV: 3, CT: 4, »X: 5}}"), "mode 'X' is not defined; there are CV, CT"),
-    ((NOISE, "»position_std_m: {CV: 3}}"), "has no value for mode 'CT'; add it, or give the mode a"),
+    (
+        (PROBABILITIES, "mode_probabilities: {CV: 0.9, »X: 0.1}"),
+        "mode 'X' is not defined; there ar",
+    ),
+    (
+        (MATRIX, "mean_sojourn_s: {CV: 20, CT: 20, »X: 1}"),
+        "mode 'X' is not defined; there are CV, ",
+    ),
+    (
+        (NOISE, "position_std_m: {CV: 3, CT: 4, »X: 5}}"),
+        "mode 'X' is not defined; there are CV, CT",
+    ),
+    (
+        (NOISE, "»position_std_m: {CV: 3}}"),
+        "has no value for mode 'CT'; add it, or give the mode a",
+    ),
     ((PROBABILITIES, "»mode_probabilities: {CV: 1}"), "has no value for mode 'CT'; add it"),
     # the bank
     (
@@ -268,7 +295,10 @@ FIT: list[tuple[Edit, str]] = [
         "mode 'CT': give exactly one of acceleration_std_m_s2 and jerk_psd_m2_s5; found",
     ),
     (("truth:  ", "»states: [x, y]\ntruth:  "), "'states' are x y and those of the modes x vx ax"),
-    ((NOISE, "»position_std_m: [1, 2, 3]}"), "one number, or one for each of 2 dimensions, and has"),
+    (
+        (NOISE, "»position_std_m: [1, 2, 3]}"),
+        "one number, or one for each of 2 dimensions, and has",
+    ),
     # the chain
     (
         (MATRIX, "transition_matrix: [»[0.95, 0.06], [0.05, 0.95]]"),
@@ -282,13 +312,22 @@ FIT: list[tuple[Edit, str]] = [
         (MATRIX, "transition_matrix: [[0.95, 0.05], [»-0.05, 1.05]]"),
         "entry 1 of row 2 of 'transition_matrix' is -0.05; a probability lies between 0 and 1",
     ),
-    ((MATRIX, "transition_matrix: [[0.95, »high], [0.05, 0.95]]"), "entry 2 of row 1 of 'transitio"),
-    ((MATRIX, "transition_matrix: [»0.95, 0.05]"), "item 1 of 'transition_matrix' is 0.95; it must"),
+    (
+        (MATRIX, "transition_matrix: [[0.95, »high], [0.05, 0.95]]"),
+        "entry 2 of row 1 of 'transitio",
+    ),
+    (
+        (MATRIX, "transition_matrix: [»0.95, 0.05]"),
+        "item 1 of 'transition_matrix' is 0.95; it must",
+    ),
     ((MATRIX, "»transition_matrix: [[1, 0]]"), "is 1 x 2 and must be 2 x 2: the modes are CV, CT"),
     ((MATRIX, "transition_matrix: [[1, 0], »[1]]"), "row 2 of 'transition_matrix' has 1 and row 1"),
     ((MATRIX, "»transition_matrix: []"), "'transition_matrix' is empty; give its rows"),
     ((MATRIX, "»transition_matrix: [[], []]"), "'transition_matrix' is empty; give its rows"),
-    ((MATRIX, f"{MATRIX}\n»mean_sojourn_s: {{CV: 9, CT: 9}}"), "and 'transition_matrix' say the sa"),
+    (
+        (MATRIX, f"{MATRIX}\n»mean_sojourn_s: {{CV: 9, CT: 9}}"),
+        "and 'transition_matrix' say the sa",
+    ),
     ((MATRIX, "mean_sojourn_s: {CV: 20, »CT: 0}"), "of 'CT' is 0; it must be greater than 0"),
     ((MATRIX, "»mean_sojourn_s: {}"), "'mean_sojourn_s' is empty; give seconds by mode: CV, CT"),
     ((MATRIX, "»mean_sojourn_s: [9, 9]"), "is a list; it must be a mapping (key: value)"),
@@ -303,7 +342,10 @@ FIT: list[tuple[Edit, str]] = [
     ((PROBABILITIES, "»mode_probabilities: {CV: 0.9, CT: 0.2}"), "sum to 1.1; make them sum to 1"),
     ((PROBABILITIES, "»mode_probabilities: [1]"), "one number for each of the modes CV, CT, and h"),
     # the start
-    ((MEAN, "»mean: [0, 0]"), "'mean' needs one number for each of the states x vx ax y vy ay, and"),
+    (
+        (MEAN, "»mean: [0, 0]"),
+        "'mean' needs one number for each of the states x vx ax y vy ay, and",
+    ),
     ((SPREAD, "  »covariance: [[1, 0], [0, 1]]\n"), "'covariance' is 2 x 2 and must be 6 x 6: the"),
     (
         (SPREAD, f"  covariance: {diagonal(first=(-1,)).replace('-1', '»-1')}\n"),
@@ -318,17 +360,26 @@ FIT: list[tuple[Edit, str]] = [
         "'covariance' is not positive semidefinite (an eigenvalue is -4)",
     ),
     ((SPREAD, f"{SPREAD}  »covariance: {diagonal()}\n"), "remove the standard deviations"),
-    ((MEAN, f"{MEAN}\n  »from_measurements: two_point"), "needs no mean and no spread; remove them"),
+    (
+        (MEAN, f"{MEAN}\n  »from_measurements: two_point"),
+        "needs no mean and no spread; remove them",
+    ),
     # estimators, windows, claims
     (("compare_with: IMM", "»compare_with: IM"), "is no estimator here; did you mean 'IMM'?"),
     ((WINDOW, "w: {»from_s: 20, until_s: 10}"), "'from_s' is 20 s, after 'until_s' (10 s); swap"),
     ((WINDOW, "»w: {from_s: 200}"), "window 'w' holds no scan: they last from 1 to 150 s; move it"),
     ((WINDOW, "w: {»after_switch_s: 9, within_switch_s: 5}"), "no step is both after 9 s and with"),
-    ((RUNS, f"scoring: {{»skip_scans: 150}}\n{RUNS}"), "is 150 of 150 scans; leave some to be scor"),
+    (
+        (RUNS, f"scoring: {{»skip_scans: 150}}\n{RUNS}"),
+        "is 150 of 150 scans; leave some to be scor",
+    ),
     ((COMPARE, COMPARE.replace("compare: [RMIMM, IMM]", "»compare: [RMIMM]")), "give at least 2"),
     ((COMPARE, f"»{COMPARE}".replace("RMIMM, IMM", "RMIMM, IM")), "'IM' is no estimator here; did"),
     ((COMPARE, f"»{COMPARE}".replace("RMIMM, IMM", "IMM, IMM")), "'compare' names IMM twice; name"),
-    ((COMPARE, COMPARE.replace("greater", "bigger").replace("sign", "»sign")), "must be less or gr"),
+    (
+        (COMPARE, COMPARE.replace("greater", "bigger").replace("sign", "»sign")),
+        "must be less or gr",
+    ),
     ((COMPARE, f"»window: turn_onst\n    {COMPARE}"), "is not defined; did you mean 'turn_onset'?"),
     (("    value: 18\n", "    value: 18\n    »sign: less\n"), "belongs to a claim with 'compare'"),
     (
@@ -347,7 +398,11 @@ ELSEWHERE: list[tuple[list[Edit], str]] = [
         "these last 1 to 149 s; give 'mean_sojourn_s' or 'generator_per_s'",
     ),
     (
-        [(MATRIX, "mean_sojourn_s: {CV: 20}"), ("-3.0, mode: CT", "-3.0, »mode: CT")],
+        [
+            (MATRIX, "mean_sojourn_s: {CV: 20}"),
+            (PROBABILITIES, ""),
+            ("-3.0, mode: CT", "-3.0, »mode: CT"),
+        ],
         "mode 'CT' is left out of 'mean_sojourn_s', so it never acts; add it there",
     ),
     (
@@ -378,25 +433,51 @@ ELSEWHERE: list[tuple[list[Edit], str]] = [
 
 SLOW = "state_transition: [[1, 0.5], [0, 1]]"
 SLOW_NOISE = "process_noise_covariance: [[0.01, 0.02], [0.02, 0.1]]"
-CHAIN_START = "initial: {mean: [0, 10], covariance: [[4, 1], [1, 9]], mode_probabilities: [0.2, 0.8]}"
-OWN = "modes: {A: {motion: constant_velocity, acceleration_std_m_s2: 1%s}}"
+CHAIN_START = (
+    "initial: {mean: [0, 10], covariance: [[4, 1], [1, 9]], mode_probabilities: [0.2, 0.8]}"
+)
+OWN_MODES = "modes: {A: {motion: constant_velocity, acceleration_std_g: 1, »position_std_m: 3}}"
 
 # The same of a chain in one dimension, with its modes given by matrices.
 MATRICES: list[tuple[list[Edit], str]] = [
     ([(SLOW, "»state_transition: [[1]]")], "is 1 x 1 and must be 2 x 2: the states are x vx"),
     ([(SLOW, "state_transition: [[1, 0.5], »[1]]")], "row 2 of 'state_transition' has 1 and row 1"),
     ([(SLOW_NOISE, "»process_noise_covariance: [[1]]")], "is 1 x 1 and must be 2 x 2: the states"),
-    ([(SLOW_NOISE, "process_noise_covariance: [[1, 2], [2, »-1]]")], "entry 2 of row 2 of 'process"),
-    ([(SLOW_NOISE, "process_noise_covariance: [[1, 2], [»3, 9]]")], "'process_noise_covariance' is"),
+    (
+        [(SLOW_NOISE, "process_noise_covariance: [[1, 2], [2, »-1]]")],
+        "entry 2 of row 2 of 'process",
+    ),
+    (
+        [(SLOW_NOISE, "process_noise_covariance: [[1, 2], [»3, 9]]")],
+        "'process_noise_covariance' is",
+    ),
     ([(SLOW_NOISE, "»process_noise_covariance: [[1, 2], [2, 1]]")], "is not positive semidefinite"),
-    ([(SLOW_NOISE, ""), ("  slow:", "  »slow:")], "'process_noise_covariance' is missing in 'slow'"),
-    ([("input_effect: [0, 1]", "»input_effect: [0]")], "one number for each of the states x vx, and"),
-    ([("[[1, 0]]", "[[1]]"), ("measurement_matrix", "»measurement_matrix")], "and must be 1 x 2: one"),
-    ([("[[16]]", "[[0]]"), ("measurement_noise", "»measurement_noise")], "is not positive definite"),
+    (
+        [(SLOW_NOISE, ""), ("  slow:", "  »slow:")],
+        "'process_noise_covariance' is missing in 'slow'",
+    ),
+    (
+        [("input_effect: [0, 1]", "»input_effect: [0]")],
+        "one number for each of the states x vx, and",
+    ),
+    (
+        [("[[1, 0]]", "[[1]]"), ("measurement_matrix", "»measurement_matrix")],
+        "and must be 1 x 2: one",
+    ),
+    (
+        [("[[16]]", "[[0]]"), ("measurement_noise", "»measurement_noise")],
+        "is not positive definite",
+    ),
     ([("[[16]]", "[[»-1]]")], "is -1; a variance is never negative"),
-    ([("states: [x, vx]", ""), ("  slow:", "  »slow:")], "'states' must name the state vector, such"),
+    (
+        [("states: [x, vx]", ""), ("  slow:", "  »slow:")],
+        "'states' must name the state vector, such",
+    ),
     ([("states: [x, vx]", "»states: [x, x]")], "'states' names a state twice; every name stands"),
-    ([("states: [x, vx]", "states: [p, v]"), ("  slow:", "  »slow:")], "has no state 'x' that could"),
+    (
+        [("states: [x, vx]", "states: [p, v]"), ("  slow:", "  »slow:")],
+        "has no state 'x' that could",
+    ),
     (
         [
             ("states: [x, vx]", "states: [p, v]"),
@@ -406,7 +487,10 @@ MATRICES: list[tuple[list[Edit], str]] = [
         "the truth has no state 'x' that could be measured; name its positions x (and y) in",
     ),
     (
-        [("{step_s: 0.5, duration_s: 5}", "{times_s: [0, 1, 3]}"), ("transition_m", "»transition_m")],
+        [
+            ("{step_s: 0.5, duration_s: 5}", "{times_s: [0, 1, 3]}"),
+            ("transition_m", "»transition_m"),
+        ],
         "'transition_matrix' holds for steps of one length and these last 1 to 2 s; give",
     ),
     (
@@ -420,8 +504,8 @@ MATRICES: list[tuple[list[Edit], str]] = [
     ([(CHAIN_START, "»initial: {mean: truth}")], "the truth's own start needs a 'mean' of numbers"),
     ([(CHAIN_START, ""), ("  chain:\n", "  »chain: {}\n")], "'initial' is missing in 'chain'; add"),
     (
-        [(CHAIN_START, f"{CHAIN_START.replace(', mode_probabilities: [0.2, 0.8]', '')}\n    {OWN}")],
-        "",
+        [(CHAIN_START, f"initial: {{mean: [0, 1]}}\n    {OWN_MODES}")],
+        "'position_std_m' has no place in the truth's modes, since the sensor measures; remove it",
     ),
 ]
 
@@ -433,7 +517,9 @@ def placed(text: str, edits: list[Edit]) -> tuple[str, str]:
         text = text.replace(old, new, 1)
     assert text.count("»") == 1
     before = text[: text.index("»")]
-    return text.replace("»", ""), f"{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
+    return text.replace(
+        "»", ""
+    ), f"{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
 
 
 def check_refused(text: str, edits: list[Edit], sentence: str, folder: Path) -> None:
@@ -467,3 +553,418 @@ def test_what_is_refused_in_matrices(edits: list[Edit], sentence: str, tmp_path:
 def test_of_two_mistakes_the_first_in_the_file_is_told(tmp_path: Path) -> None:
     text = FIG5.read_text().replace("seed: 5", "seed: x").replace("step_s: 1,", "step_s: x,")
     assert "'step_s' is x" in complaint(text, tmp_path / "a.yaml")
+
+
+# --- files and settings --------------------------------------------------------------------------
+
+
+def refused(config: Path | str, *changes: str) -> str:
+    with pytest.raises(UserError) as caught:
+        load(config, changes)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_files_that_hold_no_scenario(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    assert refused(file) == f"{file}: there is no such file; check the path"
+    assert refused(tmp_path) == f"{tmp_path}: this is a folder; name a YAML file in it"
+    for text in ("", "# nothing\n"):
+        assert complaint(text, file).startswith(f"{file}: there is nothing in it; a scenario is")
+    assert complaint("- 1\n", file) == (
+        f"{file}:1:1: a scenario is `key: value` lines, but this is a list"
+    )
+    assert refused("rmimm_fig6").endswith("is shipped; did you mean 'rmimm_fig5'?")
+
+
+def test_a_file_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def deny(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")  # an administrator may read every file
+
+    file = tmp_path / "a.yaml"
+    file.write_text(CHAIN)
+    monkeypatch.setattr(Path, "open", deny)
+    assert refused(file) == (
+        f"{file}: cannot be read (permission denied); check its name and rights"
+    )
+
+
+def test_settings_change_the_experiment() -> None:
+    changed = load(FIG5, ["monte_carlo.runs=50", "sensor.position_std_m=10"])
+    assert changed.runs == 50
+    assert changed.sensor.noise_covariance.tolist() == [[[100, 0], [0, 100]]]
+    assert changed.resolved["monte_carlo"] == {"runs": 50, "seed": 5, "keep_tracks": 1}
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("monte_carlo.runs=0", "'runs' is 0; it must be at least 1"),
+        ("monte_carlo.rums=5", "'rums' is not a key here; did you mean 'runs'?"),
+        ("truth.legs.1.mode=X", "mode 'X' is not defined; there are CV, CT"),
+        ("truth.legs.2={}", "'until_s' (or until_min, until_h) is missing in item 3 of 'legs'"),
+        ("transition_matrix=[[1, 1], [0, 1]]", "row 1 of 'transition_matrix' (from CV) sums to 2"),
+        ("estimators.NEW.type=im", "'type' is im, which is not known; did you mean 'imm'?"),
+        ("sensor.position_std_m=.inf", ".inf is not a finite number; give one that is"),
+    ],
+)
+def test_a_mistake_in_a_setting_names_the_setting(setting: str, sentence: str) -> None:
+    assert refused(FIG5, setting).startswith(f"--set {setting}: {sentence}")
+
+
+# --- any mutation --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", [FIG5.read_text(), CHAIN], ids=["legs", "chain"])
+@settings(max_examples=60, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_a_mutated_scenario_loads_or_is_refused(
+    text: str, data: st.DataObject, tmp_path: Path
+) -> None:
+    mutated = data.draw(mutations(scenario_data(text, tmp_path)))
+    load_or_complain(mutated, tmp_path / "a.yaml")
+
+
+# --- good input ----------------------------------------------------------------------------------
+
+
+def same(one: Any, other: Any, rtol: float = 0.0) -> bool:
+    """Equality through NamedTuples, mappings and arrays.
+
+    Numbers may differ by `rtol` of the largest of their array: y = 6e-17 m is a rounded 0 m.
+    """
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k], rtol) for k in one)
+    if isinstance(one, tuple | list):
+        pairs = zip(one, other, strict=False)
+        return len(one) == len(other) and all(same(a, b, rtol) for a, b in pairs)
+    if isinstance(one, float | np.ndarray):
+        if np.shape(one) != np.shape(other):
+            return False
+        largest = np.max(np.abs(other), initial=0.0, where=np.isfinite(other))
+        return np.allclose(one, other, 0.0, rtol * largest, equal_nan=True)
+    return bool(one == other)
+
+
+def loaded(text: str, folder: Path, *changes: str) -> Experiment:
+    file = folder / "a.yaml"
+    file.write_text(text)
+    return load(file, changes)
+
+
+# How many SI units one is, from the definitions of the foot, the nautical mile and g.
+LENGTHS = {"m": 1, "km": 1000, "ft": 0.3048, "nmi": 1852}
+TIMES = {"s": 1, "min": 60, "h": 3600}
+ANGLES = {"rad": 1, "deg": np.pi / 180}
+SPELLINGS: list[tuple[str, str, float, Mapping[str, float]]] = [
+    ("clock", "step_s", 1, TIMES),
+    ("clock", "duration_s", 150, TIMES),
+    ("truth.start", "heading_deg", np.pi / 2, ANGLES),
+    ("truth.start", "speed_kt", 480 * 1852 / 3600, {"m_s": 1, "km_h": 1 / 3.6, "kt": 1852 / 3600}),
+    ("truth.legs.0", "until_s", 30, TIMES),
+    ("truth.legs.1", "turn_rate_deg_s", -np.pi / 60, {"rad_s": 1, "deg_s": np.pi / 180}),
+    ("sensor", "position_std_m", 17.7, LENGTHS),
+    ("modes.CT", "acceleration_std_m_s2", 3, {"m_s2": 1, "ft_s2": 0.3048, "g": 9.80665}),
+    ("initial", "velocity_std_m_s", 10, {"m_s": 1, "km_h": 1 / 3.6, "kt": 1852 / 3600}),
+    ("estimators.RMIMM", "residual_floor_m", 1, LENGTHS),
+    ("windows.straight_settled", "after_switch_s", 10, TIMES),
+]
+
+
+@pytest.mark.parametrize(
+    ("where", "key", "si", "unit", "factor"),
+    [
+        (where, key, si, unit, factor)
+        for where, key, si, units in SPELLINGS
+        for unit, factor in units.items()
+    ],
+)
+def test_every_spelling_of_a_unit_means_the_same(
+    where: str, key: str, si: float, unit: str, factor: float, tmp_path: Path
+) -> None:
+    data = read(FIG5).data
+    holder: Any = data
+    for part in where.split("."):
+        holder = holder[int(part) if part.isdigit() else part]
+    suffixes = ("deg_s", "m_s2", "m_s", "deg", "kt", "m", "s")
+    stem = next(key.removesuffix(f"_{s}") for s in suffixes if key.endswith(f"_{s}"))
+    del holder[key]
+    holder[f"{stem}_{unit}"] = si / factor
+    original = without_claims(load(FIG5))
+    spelled = without_claims(loaded(dump(data), tmp_path))
+    is_same = same(spelled, original, 1e-12)  # the few roundings of a conversion and of an arc
+    assert is_same
+    if where != "clock":  # a change of 1e-9 is seen; the clock's would be no whole number of steps
+        holder[f"{stem}_{unit}"] *= 1 + 1e-9
+        is_same = same(without_claims(loaded(dump(data), tmp_path)), original, 1e-12)
+        assert not is_same
+
+
+def without_claims(experiment: Experiment) -> Experiment:
+    """For comparing: a dump forgets how many digits a claim was printed with."""
+    return experiment._replace(resolved={}, claims=())
+
+
+def test_lists_and_times_are_converted_item_by_item(tmp_path: Path) -> None:
+    text = (
+        FIG5.read_text()
+        .replace(SPAN, "times_min: [0, 1, 2.5]")
+        .replace(MATRIX, "mean_sojourn_min: {CV: 2, CT: 0.5}")
+    )
+    text = text.replace(NOISE, "position_std_km: [0.01, 0.02]}").replace("[0, 0]", "[0, 2]")
+    text = text.replace("position_m:", "position_nmi:")
+    experiment = loaded(text, tmp_path)
+    case = experiment.cases[0]
+    assert case.times_s.tolist() == [0, 60, 150]
+    assert experiment.sensor.noise_covariance.tolist() == [[[100, 0], [0, 400]]]
+    assert isinstance(case.truth, FixedTruth)
+    assert case.truth.state[0, [0, 2]].tolist() == [0, 3704]
+    assert experiment.bank.generator_per_s is not None
+    np.testing.assert_allclose(
+        experiment.bank.generator_per_s, [[-1 / 120, 1 / 120], [1 / 30, -1 / 30]], rtol=1e-15
+    )
+
+
+@pytest.mark.parametrize("name", sorted(shipped()))
+def test_a_resolved_scenario_is_the_scenario(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = load(name)
+    monkeypatch.chdir(tmp_path)
+    again = loaded(dump(experiment.resolved), tmp_path)
+    is_same = same(again, experiment)  # bit for bit: dump writes every digit
+    assert is_same
+    assert digest(again) == digest(experiment)
+
+
+def test_a_resolved_chain_is_the_chain(tmp_path: Path) -> None:
+    experiment = loaded(CHAIN, tmp_path)
+    again = loaded(dump(experiment.resolved), tmp_path)
+    is_same = same(again, experiment)
+    assert is_same
+    assert digest(again) == digest(experiment)
+
+
+def test_the_digest_knows_what_matters() -> None:
+    digests = {
+        setting: digest(load(FIG5, [setting]))
+        for setting in (
+            "monte_carlo.seed=5",
+            "monte_carlo.runs=50",
+            "sensor.position_std_m=17.70",
+            "monte_carlo.seed=6",
+            "sensor.position_std_m=17.71",
+            "estimators.KF_CA.mode=CV",
+            "published.0.value=18.0",
+        )
+    }
+    unchanged, *changed = list(digests.values())[:1] + list(digests.values())[3:]
+    assert list(digests.values())[:3] == [unchanged] * 3
+    assert len({unchanged, *changed}) == 1 + len(changed)
+
+
+def test_legs_and_the_claims_of_figure_5() -> None:
+    experiment = load(FIG5)
+    case = experiment.cases[0]
+    assert experiment.name == "rmimm_fig5"
+    assert experiment.truth_modes == experiment.bank.names == ("CV", "CT")
+    assert case.times_s.tolist() == list(range(151))
+    truth = case.truth
+    assert isinstance(truth, FixedTruth)
+    # The mode of a step is that of the leg in which it ends: the first turn is steps 31 to 50.
+    turning = [*range(31, 51), *range(71, 91), *range(111, 131)]
+    assert np.flatnonzero(truth.mode[1:] == 1).tolist() == [k - 1 for k in turning]
+    # Half a unit of the last printed digit: 18, 2.3, 15, 2.1; comparisons have none.
+    assert [claim.tolerance for claim in experiment.claims[:4]] == [0.5, 0.05, 0.5, 0.05]
+    assert [window.name for window in experiment.windows] == [
+        "all",
+        "straight_settled",
+        "turn_onset",
+    ]
+    assert experiment.windows[1].after_switch_s == 10
+    assert experiment.windows[2].mode == 1
+
+
+def test_a_chain_by_its_matrices(tmp_path: Path) -> None:
+    experiment = loaded(CHAIN, tmp_path)
+    truth = experiment.cases[0].truth
+    assert isinstance(truth, ChainTruth)
+    assert truth.bank.state_names == ("x", "vx")
+    assert truth.bank.transition_matrix is not None
+    assert truth.bank.transition_matrix.tolist() == [[0.9, 0.1], [0.3, 0.7]]
+    assert truth.bank.initial_mode_probabilities.tolist() == [0.2, 0.8]
+    assert truth.initial_mean.tolist() == [0, 10]
+    assert truth.initial_covariance.tolist() == [[4, 1], [1, 9]]
+    assert experiment.bank.initial_mode_probabilities.tolist() == [0.5, 0.5]
+    assert experiment.initial.covariance.tolist() == [[1, 0], [0, 4]]
+    slow, fast = experiment.bank.modes
+    assert slow.measurement_noise_covariance.tolist() == [[9]]  # the sensor's
+    assert fast.measurement_noise_covariance.tolist() == [[16]]  # its own
+    assert fast.matrices is not None
+    assert fast.matrices.state_transition.tolist() == [[[1, 0.5], [0, 0.9]]]
+    assert fast.matrices.input_effect.tolist() == [[0, 1]]
+    assert fast.measurement_matrix is not None
+    assert experiment.windows[1][:3] == ("late", 2, 4)
+
+
+def test_a_chain_with_modes_and_a_matrix_of_its_own(tmp_path: Path) -> None:
+    text = CHAIN.replace(
+        CHAIN_START,
+        "initial: {mean: [0, 10]}\n"
+        "    modes:\n"
+        "      A: {motion: constant_velocity, acceleration_psd_m2_s3: 2}\n"
+        "      B: {motion: constant_velocity, acceleration_psd_m2_s3: 3}\n"
+        "      C: {motion: constant_velocity, acceleration_psd_m2_s3: 4}\n"
+        "    transition_matrix: [[0.5, 0.5, 0], [0, 0.5, 0.5], [1, 0, 0]]",
+    )
+    experiment = loaded(text, tmp_path)
+    truth = experiment.cases[0].truth
+    assert isinstance(truth, ChainTruth)
+    assert experiment.truth_modes == truth.bank.names == ("A", "B", "C")
+    assert truth.bank.transition_matrix is not None
+    assert truth.bank.transition_matrix.tolist() == [[0.5, 0.5, 0], [0, 0.5, 0.5], [1, 0, 0]]
+    assert truth.bank.modes[2].parameters == {"acceleration_psd_m2_s3": 4}
+    assert not truth.initial_covariance.any()  # a fixed start
+    assert experiment.bank.names == ("slow", "fast")
+    # The scenario's matrix is for two modes and can't serve three.
+    message = complaint(text.replace("    transition_matrix: [[0.5", "    #"), tmp_path / "b.yaml")
+    assert "is 2 x 2 and must be 3 x 3: the modes are A, B, C" in message
+
+
+def test_a_chain_with_a_matrix_of_its_own_and_the_modes_of_the_scenario(tmp_path: Path) -> None:
+    own = "initial: {mean: [0, 10]}\n    generator_per_s: [[-1, 1], [2, -2]]"
+    experiment = loaded(CHAIN.replace(CHAIN_START, own), tmp_path)
+    truth = experiment.cases[0].truth
+    assert isinstance(truth, ChainTruth)
+    assert same(truth.bank.modes, experiment.bank.modes)
+    assert truth.bank.transition_matrix is None
+    assert truth.bank.generator_per_s is not None
+    assert truth.bank.generator_per_s.tolist() == [[-1, 1], [2, -2]]
+    assert experiment.bank.generator_per_s is None
+
+
+def test_sojourns_and_generator_at_uneven_times(tmp_path: Path) -> None:
+    text = FIG5.read_text().replace(SPAN, "times_s: [0, 1, 3, 150]")
+    sojourns = loaded(text.replace(MATRIX, "mean_sojourn_s: {CV: 20, CT: 5}"), tmp_path)
+    generator = loaded(
+        text.replace(MATRIX, "generator_per_s: [[-0.05, 0.05], [0.2, -0.2]]"), tmp_path
+    )
+    step_s = np.diff(sojourns.cases[0].times_s)
+    for experiment in (sojourns, generator):
+        model = experiment.bank.discretise(step_s, np.zeros(6), np.eye(6))
+        # The exponential of a 2 x 2 generator in closed form: away = a / (a + b) (1 - e^-(a+b)T).
+        away = 0.05 / 0.25 * (1 - np.exp(-0.25 * step_s))
+        back = 0.2 / 0.25 * (1 - np.exp(-0.25 * step_s))
+        expected = np.array([[1 - away, away], [back, 1 - back]]).transpose(2, 0, 1)
+        np.testing.assert_allclose(model.transition_matrix, expected, rtol=1e-13)  # rounding
+
+
+def test_steps_in_decimals_are_even(tmp_path: Path) -> None:
+    # Multiples of 0.1 differ in their last bits; they still are steps of one length.
+    text = CHAIN.replace("from_s: 2", "from_s: 0")
+    for clock in (
+        "step_s: 0.1, duration_s: 0.7",
+        "times_s: [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]",
+    ):
+        experiment = loaded(text.replace("step_s: 0.5, duration_s: 5", clock), tmp_path)
+        assert len(set(np.diff(experiment.cases[0].times_s).tolist())) > 1
+        assert experiment.bank.transition_matrix is not None
+
+
+def test_noise_by_mode_by_axis_and_as_a_filter_believes_it(tmp_path: Path) -> None:
+    text = FIG5.read_text()
+    by_mode = loaded(text.replace(NOISE, "position_std_m: {CT: 3, CV: 2}}"), tmp_path)
+    assert by_mode.sensor.noise_covariance[:, 0, 0].tolist() == [4, 9]  # in the modes' order
+    assert [m.measurement_noise_covariance[1, 1] for m in by_mode.bank.modes] == [4, 9]
+    believed = text.replace(NOISE, "position_std_m: [2, 3], detection_probability: 0.9}").replace(
+        CT, CT.replace("}", ", position_std_m: [4, 5]}")
+    )
+    experiment = loaded(believed, tmp_path)
+    assert experiment.sensor.noise_covariance.tolist() == [[[4, 0], [0, 9]]]
+    assert experiment.sensor.detection_probability == 0.9
+    covariances = [np.diag(m.measurement_noise_covariance) for m in experiment.bank.modes]
+    assert np.array(covariances).tolist() == [[4, 9], [16, 25]]
+
+
+def test_the_ways_to_start(tmp_path: Path) -> None:
+    text = FIG5.read_text()
+    drawn = load(FIG5).initial
+    assert (drawn.two_point, drawn.follows_truth, drawn.drawn) == (False, True, True)
+    axis = [17.7**2, 100, 1e-6]
+    np.testing.assert_allclose(np.diag(drawn.covariance), axis * 2, rtol=1e-15)
+    exact = loaded(text.replace(MEAN, "mean: truth").replace(SPREAD, ""), tmp_path).initial
+    assert (exact.follows_truth, exact.drawn) == (True, False)
+    assert not exact.covariance.any()
+    numbers = text.replace(MEAN, "mean: [1, 2, 3, 4, 5, 6]").replace(
+        SPREAD, f"  covariance: {diagonal(first=(2, 1)).replace('[0, 1', '[1, 1', 1)}\n"
+    )
+    given = loaded(numbers, tmp_path).initial
+    assert (given.follows_truth, given.mean.tolist()) == (False, [1, 2, 3, 4, 5, 6])
+    assert given.covariance[:2, :2].tolist() == [[2, 1], [1, 1]]
+    scans = text.replace(MEAN, "from_measurements: two_point").replace(SPREAD, "")
+    experiment = loaded(scans, tmp_path)
+    assert experiment.initial.two_point
+    assert experiment.sensor.certain_scans == 2  # the two scans are always seen
+
+
+def test_a_claim_in_other_digits(tmp_path: Path) -> None:
+    text = FIG5.read_text()
+    for written, tolerance in (("18.0", 0.05), ("1.8e1", 0.5), ("0x12", 0.5), ("180e-1", 0.05)):
+        claim = loaded(text.replace("value: 18\n", f"value: {written}\n"), tmp_path).claims[0]
+        assert claim.value == 18
+        assert claim.tolerance == pytest.approx(tolerance, rel=1e-15)
+    assert load(FIG5, ["published.0.tolerance=2"]).claims[0].tolerance == 2
+
+
+# --- the JSON Schema -----------------------------------------------------------------------------
+
+
+def forms(schema: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The alternatives that a node stands for, references followed."""
+    if "$ref" in node:
+        yield from forms(schema, schema["$defs"][node["$ref"].rpartition("/")[2]])
+    for key in ("anyOf", "oneOf"):
+        for part in node.get(key, []):
+            yield from forms(schema, part)
+    if "type" in node or "properties" in node:
+        yield node
+
+
+def described(schema: dict[str, Any], node: dict[str, Any], value: Any) -> bool:
+    """Whether the schema knows every key of the value."""
+    if isinstance(value, list):
+        kinds = [form for form in forms(schema, node) if form.get("type") == "array"]
+        items = [form.get("items", {}) for form in kinds]
+        return any(all(described(schema, item, part) for part in value) for item in items)
+    if not isinstance(value, dict):
+        return value == node.get("const", value)
+    for form in forms(schema, node):
+        known = form.get("properties", {})
+        others = [*form.get("patternProperties", {}).values()]
+        if isinstance(form.get("additionalProperties"), dict):
+            others.append(form["additionalProperties"])
+        parts = [(known.get(key) or next(iter(others), None), part) for key, part in value.items()]
+        if form.get("type") == "object" and all(
+            found is not None and described(schema, found, part) for found, part in parts
+        ):
+            return True
+    return False
+
+
+def test_the_json_schema_knows_every_key_of_every_scenario(tmp_path: Path) -> None:
+    schema = json.loads(json.dumps(json_schema()))
+    assert schema["$schema"].startswith("https://json-schema.org/")
+    for path in shipped().values():
+        assert described(schema, schema, read(path).data), path.name
+    chain = scenario_data(CHAIN, tmp_path)
+    assert described(schema, schema, chain)
+    spelled = read(FIG5).data
+    spelled["truth"]["start"] = {"position_nmi": [0, 0], "speed_km_h": 900, "heading_rad": 1}
+    assert described(schema, schema, spelled)
+
+
+@pytest.mark.parametrize("path", ["sede", "clock.stepp_s", "modes.CV.x", "estimators.IMM.mode"])
+def test_the_json_schema_knows_no_other_key(path: str) -> None:
+    schema = json_schema()
+    data = read(FIG5).with_setting(f"{path}=1").data
+    assert not described(schema, schema, data)

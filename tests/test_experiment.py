@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from models import RANDOM, SMALL, scenario
 
 from hybridtrack import experiment as room
 from hybridtrack.blocks import BlockTask, run_block, summarise
@@ -20,6 +19,7 @@ from hybridtrack.config import load
 from hybridtrack.experiment import digest, is_complete, paired, plan, run
 from hybridtrack.results import RunFolder, read_manifest, read_run_sums, read_table
 from hybridtrack.statistics import METRICS, RunSums, compare, ratio_of_sums
+from models import RANDOM, SMALL, scenario
 
 TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published")
 

@@ -1,8 +1,8 @@
 """The README says what the commands print today, and names every command and scenario."""
 
 import pytest
-import readme
 
+import readme
 from hybridtrack.catalogue import catalogue
 from hybridtrack.cli import app
 

@@ -9,7 +9,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from models import SMALL, scenario
 
 from hybridtrack.errors import UserError
 from hybridtrack.experiment import paired, run
@@ -24,6 +23,7 @@ from hybridtrack.results import (
     require_complete,
     write_text,
 )
+from models import SMALL, scenario
 
 
 def quiet(done, total):

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from models import random_model
 from scipy.integrate import solve_ivp
 
 from hybridtrack.errors import UserError
@@ -33,6 +32,7 @@ from hybridtrack.simulation import (
     stream,
     two_point_start,
 )
+from models import random_model
 
 SIGMAS = 5.0
 ROUNDING = 1e-9  # metres at 1e5 m: 1e-16 relative, some 1e2 operations

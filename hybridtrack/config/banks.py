@@ -80,13 +80,13 @@ def try_out(
     these = f"for steps of one length and these last {shortest:g} to {longest:g} s"
     if uneven and bank.transition_matrix is not None:
         raise document.error(
-            (*path, "transition_matrix"),
+            _whence(document, path, "transition_matrix"),
             f"'transition_matrix' holds {these}; give 'mean_sojourn_s' or 'generator_per_s'",
         )
     for mode in bank.modes:
         if uneven and mode.motion is None:
             raise document.error(
-                (*path, "modes", mode.name),
+                _whence(document, path, "modes", mode.name),
                 f"the matrices of mode '{mode.name}' hold {these}; name a motion instead",
             )
     n_x = len(bank.state_names)
@@ -97,7 +97,7 @@ def try_out(
         parts = (model.state_transition, model.process_noise_covariance, model.input_effect)
         if not all(np.isfinite(part[:, j]).all() for part in parts):
             raise document.error(
-                (*path, "modes", name),
+                _whence(document, path, "modes", name),
                 f"mode '{name}' has numbers too large to compute with; check its units",
             )
     if not np.isfinite(model.transition_matrix).all():
@@ -105,6 +105,11 @@ def try_out(
             path, "the rates of the chain are too large to compute with; check their units"
         )
     return model
+
+
+def _whence(document: Document, path: Keys, *keys: str) -> Keys:
+    """Where a chain's truth has something: of its own, or from the scenario."""
+    return (*path, *keys) if (*path, *keys) in document.places else keys
 
 
 def _chain(
