@@ -937,7 +937,7 @@ def described(schema: dict[str, Any], node: dict[str, Any], value: Any) -> bool:
         items = [form.get("items", {}) for form in kinds]
         return any(all(described(schema, item, part) for part in value) for item in items)
     if not isinstance(value, dict):
-        return value == node.get("const", value)
+        return bool(value == node.get("const", value))
     for form in forms(schema, node):
         known = form.get("properties", {})
         others = [*form.get("patternProperties", {}).values()]

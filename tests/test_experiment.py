@@ -16,7 +16,8 @@ import pytest
 from hybridtrack import experiment as room
 from hybridtrack.blocks import BlockTask, run_block, summarise
 from hybridtrack.config import load
-from hybridtrack.experiment import digest, is_complete, paired, plan, run
+from hybridtrack.experiment import digest, is_complete, plan, run
+from hybridtrack.outcomes import paired
 from hybridtrack.results import RunFolder, read_manifest, read_run_sums, read_table
 from hybridtrack.statistics import METRICS, RunSums, compare, ratio_of_sums
 from models import RANDOM, SMALL, scenario

@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from hybridtrack.errors import UserError
-from hybridtrack.experiment import paired, run
+from hybridtrack.experiment import run
+from hybridtrack.outcomes import paired
 from hybridtrack.results import (
     SCHEMAS,
     RunFolder,

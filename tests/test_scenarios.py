@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybridtrack import config, experiment, results
+from hybridtrack import config, experiment, outcomes, results
 from hybridtrack.models import Mode
 
 
@@ -42,7 +42,7 @@ def test_the_recorded_flight_is_what_it_was(flight):
 def test_two_models_beat_one_on_the_recorded_flight(flight):
     """Ratio of position RMSE below .97 by three standard errors, over 20 noise seeds."""
     _, path = flight
-    ratio = experiment.paired(path, "IMM", "KF", "position_rmse_m", "all").ratio
+    ratio = outcomes.paired(path, "IMM", "KF", "position_rmse_m", "all").ratio
     assert ratio.n_runs == 20
     assert ratio.value + 3 * ratio.standard_error < 0.97
 
