@@ -123,7 +123,7 @@ def run(
     folder = out if out is not None else experiments.default_folder(experiment)
     try:
         if force:
-            results.clear(folder)
+            results.clear(folder, experiments.digest(experiment))
         if experiments.is_complete(folder, experiment):
             if not quiet:
                 say(f"complete already: {folder} is shown, not repeated (--force repeats it)")

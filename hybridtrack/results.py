@@ -295,15 +295,29 @@ def _locked(path: Path) -> IO[str]:
     return file
 
 
-def clear(path: Path) -> None:
-    """Remove a run folder (and nothing else). Raises UserError where it isn't one, or in use."""
+def clear(path: Path, digest: str) -> None:
+    """Remove what a run wrote into a folder, and the folder if nothing else is in it.
+
+    Whatever else is in it stays, and the folder is then the given run's. Raises UserError where
+    it isn't a run folder, or in use.
+    """
     if not path.exists():
         return
     if read_manifest(path) is None and _holds_something(path):
         raise UserError(f"{path}: this is no run folder, so it isn't cleared; name another")
     _locked(path / LOCK).close()  # nobody is writing it
     try:
-        shutil.rmtree(path)
+        for pattern in ("shards", "figures/*.png", "*.parquet", "*.part", "summary.csv"):
+            for found in path.glob(pattern):
+                shutil.rmtree(found) if found.is_dir() else found.unlink()
+        for name in ("config.yaml", LOCK, MANIFEST):
+            (path / name).unlink(missing_ok=True)
+        for folder in (path / "figures", path):
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+        if path.exists():
+            begun = {"status": RUNNING, "digest": digest}
+            write_text(path / MANIFEST, json.dumps(begun) + "\n")
     except OSError as error:
         raise UserError(f"{path}: cannot be cleared ({_reason(error)})") from None
 

@@ -110,7 +110,7 @@ def test_a_second_process_is_told_to_wait(tmp_path):
             RunFolder(folder, "d1").__enter__()
         sentence(caught)
         with pytest.raises(UserError, match="another run is writing this folder"):
-            clear(folder)  # --force while it runs
+            clear(folder, "d1")  # --force while it runs
         assert folder.exists()
         first.stdin.close()
     with RunFolder(folder, "d1"):  # free again
@@ -131,7 +131,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
         RunFolder(tmp_path, "d1")
     sentence(caught)
     with pytest.raises(UserError, match="no run folder, so it isn't cleared") as caught:
-        clear(tmp_path)
+        clear(tmp_path, "d1")
     sentence(caught)
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
@@ -157,13 +157,25 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
 
 def test_clear_removes_run_folders_finished_or_begun(damaged, tmp_path):
     _, folder = damaged
-    clear(folder)
+    clear(folder, "d1")
     assert not folder.exists()
-    clear(folder)  # nothing there: nothing to do
+    clear(folder, "d1")  # nothing there: nothing to do
     with RunFolder(tmp_path / "begun", "d1"):
         pass
-    clear(tmp_path / "begun")
+    clear(tmp_path / "begun", "d1")
     assert not (tmp_path / "begun").exists()
+
+
+def test_clear_leaves_what_a_run_did_not_write(damaged):
+    _, folder = damaged
+    (folder / "notes.txt").write_text("mine")
+    (folder / "figures").mkdir(exist_ok=True)
+    (folder / "figures" / "annotated.svg").write_text("mine too")
+    clear(folder, "d2")
+    kept = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert kept == {"notes.txt", "figures/annotated.svg", "manifest.json"}
+    with RunFolder(folder, "d2"):  # and the folder may be written again
+        pass
 
 
 # ---- damage ----------------------------------------------------------------------------------
@@ -181,7 +193,7 @@ def test_a_damaged_manifest_is_one_sentence(damaged, text):
     for use in (
         lambda: run(experiment, folder, 1, quiet),
         lambda: require_complete(folder),
-        lambda: clear(folder),
+        lambda: clear(folder, "d1"),
     ):
         with pytest.raises(UserError, match=r"manifest.json: cannot be read .*; remove") as caught:
             use()
