@@ -17,6 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.compiled import exp, kernel, log
+from hybridtrack.estimators._lanes import (
+    add_scaled,
+    apply,
+    copy,
+    fill,
+    merge,
+    merge_mean,
+    merge_share,
+    packed,
+    set_scaled,
+)
+from hybridtrack.estimators._residual_mean import divide_by_residual_mean, predict_residual
+from hybridtrack.estimators._update import update
 from hybridtrack.models import JumpMarkovModel
 
 Array = NDArray[np.float64]
@@ -82,93 +95,6 @@ class Estimates(NamedTuple):
     covariance: Array  # (n_steps, n_packed, lanes) or (0, n_packed, lanes)
 
 
-# ---- rows of lanes ---------------------------------------------------------------------------
-
-
-@kernel
-def _scale(out, factor, row):
-    for b in range(out.size):
-        out[b] = factor * row[b]
-
-
-@kernel
-def _add_scaled(out, factor, row):
-    for b in range(out.size):
-        out[b] += factor * row[b]
-
-
-@kernel
-def _copy(out, row):
-    for b in range(out.size):
-        out[b] = row[b]
-
-
-@kernel
-def _fill(out, value):
-    for b in range(out.size):
-        out[b] = value
-
-
-@kernel
-def _apply(out, matrix_row, vector, offset):
-    """out <- matrix_row . vector + offset; structural zeros are skipped."""
-    _fill(out, offset)
-    for e in range(matrix_row.size):
-        if matrix_row[e] != 0.0:
-            _add_scaled(out, matrix_row[e], vector[e])
-
-
-@kernel
-def _packed(a, c):
-    return a * (a + 1) // 2 + c if a >= c else c * (c + 1) // 2 + a
-
-
-# ---- Gaussians merged one at a time ----------------------------------------------------------
-
-
-@kernel
-def _merge_share(total, share, factor, row):
-    """share <- factor row / (total + factor row), 0 where both are 0; total grows by it."""
-    for b in range(total.size):
-        weight = factor * row[b]
-        total[b] += weight
-        share[b] = weight / total[b] if total[b] > 0.0 else 0.0
-
-
-@kernel
-def _merge_mean(mean, difference, share, other):
-    for b in range(mean.size):
-        difference[b] = other[b] - mean[b]
-        mean[b] += share[b] * difference[b]
-
-
-@kernel
-def _merge_second_moment(out, other, share, difference_a, difference_c):
-    for b in range(out.size):
-        s = share[b]
-        rest = 1.0 - s
-        out[b] = rest * (out[b] + s * (difference_a[b] * difference_c[b])) + s * other[b]
-
-
-@kernel
-def _merge(mean, covariance, share, other_mean, other_covariance, difference):
-    """Merge a second Gaussian into the first, with the given share of the sum of weights.
-
-    P <- (1 - s) P + s P' + s (1 - s) d d', d the difference of the means: positive semidefinite
-    in rounding too, since nothing is subtracted.
-    """
-    n_x = mean.shape[0]
-    for e in range(n_x):
-        _merge_mean(mean[e], difference[e], share, other_mean[e])
-    t = 0
-    for a in range(n_x):
-        for c in range(a + 1):
-            _merge_second_moment(
-                covariance[t], other_covariance[t], share, difference[a], difference[c]
-            )
-            t += 1
-
-
 # ---- the five steps --------------------------------------------------------------------------
 
 
@@ -182,12 +108,12 @@ def predict_mode_probabilities(state, work, transition):
     for j in range(n_modes):
         predicted = work.predicted_probability[j]
         log_predicted = work.log_predicted_probability[j]
-        _fill(predicted, 0.0)
+        fill(predicted, 0.0)
         origins = 0
         origin = 0
         for i in range(n_modes):
             if transition[i, j] != 0.0:
-                _add_scaled(predicted, transition[i, j], state.mode_probabilities[i])
+                add_scaled(predicted, transition[i, j], state.mode_probabilities[i])
                 origins += 1
                 origin = i
         if origins == 1:
@@ -225,7 +151,7 @@ def mix(state, work, transition, interaction, errors):
             work.mixed_error[j, :] = state.residual_error[first]
         if interaction == NO_INTERACTION:
             continue
-        _scale(
+        set_scaled(
             total,
             transition[first, j] if interaction == MIXING else 1.0,
             state.mode_probabilities[first],
@@ -234,11 +160,11 @@ def mix(state, work, transition, interaction, errors):
             factor = transition[i, j] if interaction == MIXING else 1.0
             if factor == 0.0:
                 continue
-            _merge_share(total, share, factor, state.mode_probabilities[i])
-            _merge(mean, covariance, share, state.mean[i], state.covariance[i], work.states[0])
+            merge_share(total, share, factor, state.mode_probabilities[i])
+            merge(mean, covariance, share, state.mean[i], state.covariance[i], work.states[0])
             if errors:
                 for e in range(n_x):
-                    _merge_mean(
+                    merge_mean(
                         work.mixed_error[j, e], work.rows[2], share, state.residual_error[i, e]
                     )
 
@@ -250,7 +176,7 @@ def predict(j, state, work, state_transition, input_effect, process_noise):
     mixed_covariance = work.mixed_covariance[j]
     rows = work.states[0]
     for a in range(n_x):
-        _apply(state.mean[j, a], state_transition[a], work.mixed_mean[j], input_effect[a])
+        apply(state.mean[j, a], state_transition[a], work.mixed_mean[j], input_effect[a])
         # Row a of F P, as far as the elements up to the diagonal need it, then times F'.
         for g in range(n_x):
             needed = False
@@ -261,240 +187,17 @@ def predict(j, state, work, state_transition, input_effect, process_noise):
                 for e in range(n_x):
                     factor = state_transition[a, e]
                     if factor != 0.0:
-                        source = mixed_covariance[_packed(e, g)]
+                        source = mixed_covariance[packed(e, g)]
                         if first:
-                            _scale(rows[g], factor, source)
+                            set_scaled(rows[g], factor, source)
                         else:
-                            _add_scaled(rows[g], factor, source)
+                            add_scaled(rows[g], factor, source)
                         first = False
                 if first:
-                    _fill(rows[g], 0.0)
+                    fill(rows[g], 0.0)
         for c in range(a + 1):
-            t = _packed(a, c)
-            _apply(state.covariance[j, t], state_transition[c], rows, process_noise[t])
-
-
-@kernel
-def predict_residual(j, state, work, model, state_transition, input_effect):
-    """RMIMM's mean residual of filter j (Hwang 2006, eq. 28), the true mode marginalised.
-
-    rbar_j = sum_i w_i C_i (A_i y_j + b_i) - C_j (A_j x0_j + b_j) with w the predicted mode
-    probabilities and y_j = x0_j + ebar0_j; the predicted mean error likewise without C, left in
-    state.residual_error[j]. Must follow `predict`.
-    """
-    n_modes, n_x = state.mean.shape[:2]
-    n_y = model.measurement_matrix.shape[1]
-    corrected, moved = work.states[1], work.states[2]
-    row = work.rows[2]
-    residual = work.residual_mean[j]
-    error = state.residual_error[j]
-    for e in range(n_x):
-        for b in range(row.size):
-            corrected[e, b] = work.mixed_mean[j, e, b] + work.mixed_error[j, e, b]
-        _scale(error[e], -1.0, state.mean[j, e])
-    for m in range(n_y):
-        _apply(row, model.measurement_matrix[j, m], state.mean[j], 0.0)
-        _scale(residual[m], -1.0, row)
-    for i in range(n_modes):
-        weight = work.predicted_probability[i]
-        for e in range(n_x):
-            _apply(moved[e], state_transition[i, e], corrected, input_effect[i, e])
-            for b in range(row.size):
-                error[e, b] += weight[b] * moved[e, b]
-        for m in range(n_y):
-            _apply(row, model.measurement_matrix[i, m], moved, 0.0)
-            for b in range(row.size):
-                residual[m, b] += weight[b] * row[b]
-
-
-@kernel
-def _innovate(y, mean, coefficient, variance, position_variance, out, inverse, squared, scale):
-    """Innovation of a scalar measurement; where it is missing, an update of no effect."""
-    for b in range(y.size):
-        detected = y[b] == y[b]
-        s = coefficient * coefficient * position_variance[b] + variance
-        innovation = y[b] - coefficient * mean[b] if detected else 0.0
-        inverse[b] = 1.0 / s if detected else 0.0
-        out[b] = innovation
-        squared[b] += innovation * innovation * inverse[b]
-        scale[b] *= s if detected else 1.0
-
-
-@kernel
-def _update_by_component(
-    mean, covariance, component, coefficient, variance, y, squared, scale, work
-):
-    """Update by a scalar measurement coefficient x[component] + noise.
-
-    The measured row of P is scaled by r/s instead of subtracted from, which keeps every digit
-    that Joseph's form keeps, at half its cost.
-    """
-    n_x = mean.shape[0]
-    innovation, inverse, gain = work.rows[3], work.rows[4], work.rows[5]
-    rows = work.states[1]
-    p = component
-    _innovate(
-        y,
-        mean[p],
-        coefficient,
-        variance,
-        covariance[_packed(p, p)],
-        innovation,
-        inverse,
-        squared,
-        scale,
-    )
-    for e in range(n_x):
-        source = covariance[_packed(e, p)]
-        row = rows[e]
-        for b in range(innovation.size):
-            row[b] = coefficient * source[b]
-            mean[e, b] += row[b] * inverse[b] * innovation[b]
-    for a in range(n_x):
-        if a == p:
-            continue
-        for b in range(innovation.size):
-            gain[b] = rows[a, b] * inverse[b]
-        for c in range(a + 1):
-            if c != p:
-                out, other = covariance[_packed(a, c)], rows[c]
-                for b in range(innovation.size):
-                    out[b] -= gain[b] * other[b]
-    for b in range(innovation.size):
-        gain[b] = variance * inverse[b] if inverse[b] != 0.0 else 1.0
-    for e in range(n_x):
-        out = covariance[_packed(e, p)]
-        for b in range(innovation.size):
-            out[b] *= gain[b]
-    for e in range(n_x):  # the rows become the gain, for whoever needs it afterwards
-        for b in range(innovation.size):
-            rows[e, b] *= inverse[b]
-
-
-@kernel
-def _update_by_combination(mean, covariance, h, variance, y, squared, scale, work):
-    """Update by a scalar measurement h' x + noise: Joseph's form for one measurement.
-
-    P <- A - u K' - K u' with A = P - v K', v = P h and u = (A h - r K)/2, which vanishes but
-    for the rounding of A and takes it out again.
-    """
-    n_x = mean.shape[0]
-    innovation, inverse = work.rows[3], work.rows[4]
-    expected, expected_variance = work.rows[5], work.rows[6]
-    gains, products = work.states[1], work.states[2]
-    _apply(expected, h, mean, 0.0)
-    _fill(expected_variance, 0.0)
-    for a in range(n_x):
-        _fill(products[a], 0.0)
-        for e in range(n_x):
-            if h[e] != 0.0:
-                _add_scaled(products[a], h[e], covariance[_packed(a, e)])
-    _apply(expected_variance, h, products, 0.0)
-    _innovate(y, expected, 1.0, variance, expected_variance, innovation, inverse, squared, scale)
-    for a in range(n_x):
-        for b in range(innovation.size):
-            gains[a, b] = products[a, b] * inverse[b]
-            mean[a, b] += gains[a, b] * innovation[b]
-    for a in range(n_x):
-        for c in range(a + 1):
-            out = covariance[_packed(a, c)]
-            for b in range(innovation.size):
-                out[b] -= 0.5 * (products[a, b] * gains[c, b] + products[c, b] * gains[a, b])
-    for a in range(n_x):
-        _scale(products[a], -variance, gains[a])
-        for e in range(n_x):
-            if h[e] != 0.0:
-                _add_scaled(products[a], h[e], covariance[_packed(a, e)])
-    for a in range(n_x):
-        for c in range(a + 1):
-            out = covariance[_packed(a, c)]
-            for b in range(innovation.size):
-                correction = products[a, b] * gains[c, b] + products[c, b] * gains[a, b]
-                # Where the measurement is missing the gain is 0, and the correction with it.
-                out[b] -= 0.5 * correction
-
-
-@kernel
-def update(j, state, work, model, y, errors):
-    """Kalman update of mode j by the scan y (n_y, lanes), one decorrelated component at a time.
-
-    Leaves the log-likelihood (without its constant; 0 where the scan is missing) in
-    work.log_likelihood[j]; with `errors` also takes K rbar off RMIMM's mean error.
-    """
-    n_y, n_x = model.measurement_matrix.shape[1:]
-    mean, covariance = state.mean[j], state.covariance[j]
-    squared, scale, measured, correction = work.rows[7], work.rows[8], work.rows[9], work.rows[10]
-    taken = work.states[0]  # K rbar, built up component by component
-    _fill(squared, 0.0)
-    _fill(scale, 1.0)
-    if errors:
-        for e in range(n_x):
-            _fill(taken[e], 0.0)
-    for m in range(n_y):
-        _apply(measured, model.decorrelation[j, m], y, 0.0)
-        # A scan with a missing component is missing as a whole.
-        for other in range(n_y):
-            for b in range(measured.size):
-                measured[b] = measured[b] if y[other, b] == y[other, b] else np.nan
-        h, variance = model.decorrelated_matrix[j, m], model.decorrelated_variance[j, m]
-        components = 0
-        component = 0
-        for e in range(n_x):
-            if h[e] != 0.0:
-                components += 1
-                component = e
-        if components == 1:
-            _update_by_component(
-                mean, covariance, component, h[component], variance, measured, squared, scale, work
-            )
-        else:
-            _update_by_combination(mean, covariance, h, variance, measured, squared, scale, work)
-        if errors:
-            gains = work.states[1]
-            _apply(correction, model.decorrelation[j, m], work.residual_mean[j], 0.0)
-            for e in range(n_x):
-                if h[e] != 0.0:
-                    _add_scaled(correction, -h[e], taken[e])
-            for e in range(n_x):
-                for b in range(correction.size):
-                    taken[e, b] += gains[e, b] * correction[b]
-    log_likelihood = work.log_likelihood[j]
-    for b in range(squared.size):
-        log_likelihood[b] = -0.5 * (squared[b] + log(scale[b]))
-    if errors:
-        for e in range(n_x):
-            _add_scaled(state.residual_error[j, e], -1.0, taken[e])
-
-
-@kernel
-def divide_by_residual_mean(work, y, common, floor):
-    """RMIMM's factor N_j = 1/max(||rbar_j||, floor) on each likelihood (Hwang 2006, eq. 29).
-
-    `common` is the formula as printed, summed over the filters: the same for all of them.
-    """
-    n_modes, n_y = work.residual_mean.shape[:2]
-    norm = work.rows[2]
-    if common:
-        for m in range(n_y):
-            _fill(norm, 0.0)
-            for j in range(n_modes):
-                for b in range(norm.size):
-                    norm[b] += work.predicted_probability[j, b] * work.residual_mean[j, m, b]
-            for j in range(n_modes):
-                _copy(work.residual_mean[j, m], norm)
-    for j in range(n_modes):
-        _fill(norm, 0.0)
-        for m in range(n_y):
-            for b in range(norm.size):
-                norm[b] += work.residual_mean[j, m, b] * work.residual_mean[j, m, b]
-        for b in range(norm.size):
-            size = np.sqrt(norm[b])
-            size = floor if size < floor else size
-            for m in range(n_y):
-                size = size if y[m, b] == y[m, b] else 1.0
-            norm[b] = size
-        for b in range(norm.size):
-            work.log_likelihood[j, b] -= log(norm[b])
+            t = packed(a, c)
+            apply(state.covariance[j, t], state_transition[c], rows, process_noise[t])
 
 
 @kernel
@@ -516,9 +219,9 @@ def weigh_modes(state, work, likelihoods, floor):
     for b in range(total.size):
         largest[b] += log(total[b])
     for j in range(n_modes):
-        _add_scaled(state.log_mode_probabilities[j], -1.0, largest)
+        add_scaled(state.log_mode_probabilities[j], -1.0, largest)
     if floor > 0.0:
-        _fill(total, 0.0)
+        fill(total, 0.0)
         for j in range(n_modes):
             for b in range(total.size):
                 raised = max(state.mode_probabilities[j, b], floor)
@@ -534,11 +237,11 @@ def weigh_modes(state, work, likelihoods, floor):
 def _normalise(out, logarithms, largest, total):
     """out_j <- exp(l_j)/sum_i exp(l_i); leaves max l and sum exp(l - max l) in the last two."""
     n_modes = logarithms.shape[0]
-    _copy(largest, logarithms[0])
+    copy(largest, logarithms[0])
     for j in range(1, n_modes):
         for b in range(largest.size):
             largest[b] = logarithms[j, b] if logarithms[j, b] > largest[b] else largest[b]
-    _fill(total, 0.0)
+    fill(total, 0.0)
     for j in range(n_modes):
         for b in range(largest.size):
             value = exp(logarithms[j, b] - largest[b])
@@ -572,7 +275,7 @@ def combine(state, mean, covariance):
         t = 0
         for a in range(n_x):
             for c in range(a + 1):
-                _fill(covariance[t], 0.0)
+                fill(covariance[t], 0.0)
                 for i in range(n_modes):
                     for b in range(mean.shape[1]):
                         covariance[t, b] += state.mode_probabilities[i, b] * (
@@ -637,9 +340,9 @@ def advance(state, work, model, choices, measurements, known_modes, estimates):
         combine(state, estimates.mean[k], covariance)
         probabilities = estimates.mode_probabilities[k]
         for o in range(probabilities.shape[0]):
-            _fill(probabilities[o], 0.0)
+            fill(probabilities[o], 0.0)
         for j in range(n_modes):
-            _add_scaled(probabilities[model.output_mode[j]], 1.0, state.mode_probabilities[j])
+            add_scaled(probabilities[model.output_mode[j]], 1.0, state.mode_probabilities[j])
 
 
 # ---- from outside ----------------------------------------------------------------------------
