@@ -22,6 +22,7 @@ from hybridtrack.simulation import (
     two_point_start,
 )
 from hybridtrack.statistics import (
+    POSITION_AT_SCANS,
     Moments,
     Names,
     SumMoments,
@@ -37,7 +38,7 @@ from hybridtrack.statistics import (
 
 SPAN_STEPS = 32  # steps between two looks at Python: their arrays stay in the cache
 LANE_GROUP = 32  # lanes are filtered in whole groups, so that each takes the same instructions
-DIVERGED = 1e150  # an estimate beyond this has no finite square
+DIVERGED = 1e60  # an estimate beyond this has no use, and its fourth power must stay finite
 
 RAW = "raw"
 TRUTH = "truth"
@@ -114,7 +115,7 @@ def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) ->
     if window.mode is not None:
         mask &= truth.mode == window.mode
     if window.after_switch_s is not None:
-        mask &= truth.since_switch_s > window.after_switch_s
+        mask &= (truth.since_switch_s > window.after_switch_s) & np.isfinite(truth.since_switch_s)
     if window.within_switch_s is not None:
         mask &= truth.since_switch_s <= window.within_switch_s
     return mask
@@ -163,14 +164,14 @@ class _Block:
         experiment, initial = self._experiment, self._experiment.initial
         states = experiment.bank.state_names
         mean = np.repeat(initial.mean[:, np.newaxis], self._lanes, axis=1)
-        covariance = initial.covariance
+        banks = {id(chosen.bank): chosen.bank for chosen in experiment.estimators}
+        covariances = dict.fromkeys(banks, initial.covariance)
         self._first_step = 0
         if initial.two_point:
-            z, times_s = scans.measurements, self._case.times_s
-            noise = experiment.bank.modes[0].measurement_noise_covariance
-            mean, covariance = two_point_start(
-                z[0], z[1], float(times_s[2] - times_s[1]), noise, states
-            )
+            z, step_s = scans.measurements, float(self._step_s[1])
+            for key, bank in banks.items():
+                noise = bank.mean_measurement_noise
+                mean, covariances[key] = two_point_start(z[0], z[1], step_s, noise, states)
             self._first_step = 2
         elif initial.follows_truth:
             known = self._simulation.state_names
@@ -178,8 +179,8 @@ class _Block:
                 mean[e] = self._simulation.initial_state[known.index(name)] if name in known else 0
             if initial.drawn:
                 noise = self._simulation.initial_estimate_noise(len(states))
-                mean += square_root(covariance) @ noise
-        self._initial_covariance = covariance
+                mean += square_root(initial.covariance) @ noise
+        self._initial_covariances = covariances
         self._even_models = self._models(self._step_s[:1])
         for chosen in experiment.estimators:
             model = self._even_models[chosen.label]
@@ -193,7 +194,8 @@ class _Block:
         for chosen in self._experiment.estimators:
             bank = chosen.bank
             if id(bank) not in built:
-                built[id(bank)] = bank.discretise(step_s, nothing, self._initial_covariance)
+                start = self._initial_covariances[id(bank)]
+                built[id(bank)] = bank.discretise(step_s, nothing, start)
         return {c.label: built[id(c.bank)] for c in self._experiment.estimators}
 
     # ---- one span ----
@@ -207,10 +209,11 @@ class _Block:
         }
         known = self._simulation.state_names
         self._score_truth(span, scans)
+        skipped = max(self._first_step - span.start, 0)  # scans used up by a two-point start
         for quantity, values in score_measurements(scans, known).items():
+            values[:skipped] = np.nan
             self._take(span, RAW, quantity, values, masks)
         models = self._even_models
-        skipped = max(self._first_step - span.start, 0)  # scans used up by a two-point start
         if not self._even:
             models = self._models(self._step_s[span.start + skipped : span.stop])
         advantages: dict[str, Array] = {}
@@ -285,11 +288,11 @@ class _Block:
     ) -> None:
         """Add a span of a quantity (n_steps, lanes) to the statistics."""
         runs = self._task.runs
-        key = (label, quantity)
-        if key not in self._steps:
-            self._steps[key] = Moments(*(np.zeros(self._n_steps) for _ in range(3)))
-        here = [array[span] for array in self._steps[key]]
-        accumulate_steps(values, runs, *here)
+        if quantity != POSITION_AT_SCANS:
+            key = (label, quantity)
+            if key not in self._steps:
+                self._steps[key] = Moments(*(np.zeros(self._n_steps) for _ in range(3)))
+            accumulate_steps(values, runs, *(array[span] for array in self._steps[key]))
         for window, mask in (masks or {}).items():
             cell = (label, window, quantity)
             if cell not in self._sums:

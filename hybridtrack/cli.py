@@ -1,15 +1,22 @@
 """The command line: parse, call, print. Everything heavy is imported where it is used."""
 
+import contextlib
 import functools
+import io
+import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
 from hybridtrack import __version__
 from hybridtrack.errors import UserError
+
+if TYPE_CHECKING:
+    from hybridtrack.config import Experiment
 
 app = typer.Typer(
     name="hybridtrack",
@@ -24,25 +31,63 @@ app = typer.Typer(
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+class Interrupted(BaseException):
+    """Ctrl-C. No KeyboardInterrupt, since typer ends on that without a word."""
+
+
 def main() -> None:
     """Entry point of the console script."""
+    _prepare_streams()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _on_interrupt)
     try:
-        app()
-    except KeyboardInterrupt:
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except Interrupted:
         _interrupted()
-    except BrokenPipeError:  # the reader of a pipe went away (| head)
-        sys.stderr.close()
-        sys.exit(141)
+    except OSError as error:
+        _cannot_go_on(error)
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said; Python closes down
+
+
+def _prepare_streams() -> None:
+    """A closed stream swallows what is written; one without our characters gets `?`."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
+def _on_interrupt(number: int, frame: object) -> NoReturn:
+    raise Interrupted
 
 
 def say(text: str) -> None:
     """A line for the person, not for the pipe."""
-    print(text, file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):  # nobody listens: no reason to stop
+        print(text, file=sys.stderr, flush=True)
 
 
-def _interrupted(hint: str = "") -> None:
+def _interrupted(hint: str = "") -> NoReturn:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # heard: once more would only cut this short
     say(f"interrupted{hint}")
     sys.exit(130)
+
+
+def _cannot_go_on(error: OSError) -> NoReturn:
+    """A reader that went away (| head) ends us in silence; a full disk is told."""
+    with contextlib.suppress(OSError, ValueError):  # else Python tries stdout once more at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(error, BrokenPipeError):
+        sys.exit(141)
+    where = error.filename or "the output"
+    reason = (error.strerror or str(error)).lower()
+    say(f"error: {where}: cannot be read or written ({reason}); make room, or check its rights")
+    sys.exit(2)
 
 
 def command(*examples: str, name: str | None = None) -> Callable[[Function], Function]:
@@ -55,7 +100,9 @@ def command(*examples: str, name: str | None = None) -> Callable[[Function], Fun
                 return function(*arguments, **options)
             except UserError as error:
                 say(f"error: {error}")
-            raise typer.Exit(2)
+                raise typer.Exit(2) from None
+            except OSError as error:  # typer would take a broken pipe for itself
+                _cannot_go_on(error)
 
         epilog = "Examples:\n\n" + "\n\n".join(f"  {example}" for example in examples)
         app.command(name=name, epilog=epilog)(guarded)
@@ -105,39 +152,67 @@ def run(
 ) -> None:
     """Run a scenario and print its table, its verdicts and its folder.
 
-    A complete run is shown, not repeated; more runs continue it, and so does the same command
-    after an interruption.
+    A complete run is shown, not repeated. More runs go on from it, and the same command from an
+    interrupted one: whole shards (2,048 runs of one case) are kept.
     """
-    if not quiet:
-        _say_if_compiling()
-    from hybridtrack import config as scenarios
     from hybridtrack import experiment as experiments
     from hybridtrack import results
     from hybridtrack.executors import available_cores
     from hybridtrack.progress import progress
 
-    settings = list(set_ or [])
-    settings += [f"monte_carlo.runs={runs}"] if runs is not None else []
-    settings += [f"monte_carlo.seed={seed}"] if seed is not None else []
-    experiment = scenarios.load(config, settings)
+    experiment = _load(config, set_ or (), runs, seed)
     folder = out if out is not None else experiments.default_folder(experiment)
-    try:
-        if force:
-            results.clear(folder, experiments.digest(experiment))
-        if experiments.is_complete(folder, experiment):
-            if not quiet:
-                say(f"complete already: {folder} is shown, not repeated (--force repeats it)")
-            if not any((folder / "figures").glob("*.png")):
-                draw_figures(folder)
-        else:
+    if force:
+        results.clear(folder, experiments.digest(experiment))
+    if not experiments.is_complete(folder, experiment):
+        if not quiet:
+            _say_if_compiling()
+        try:
             with progress(quiet) as report:
                 experiments.run(experiment, folder, workers or available_cores(), report)
-            if not quiet:
-                say("drawing figures")
+        except Interrupted:
+            _interrupted(_what_is_kept(folder))
+    elif not quiet:
+        _say_complete(folder, experiment.runs)
+    if not figures_are_drawn(folder):
+        if not quiet:
+            say("drawing figures")
+        try:
             draw_figures(folder)
-    except KeyboardInterrupt:
-        _interrupted(f"; finished shards are kept in {folder}: the same command goes on there")
+        except Interrupted:
+            _interrupted(f"; {folder} is complete but for figures: the same command draws them")
     print_run(folder, json)
+
+
+def _load(config: str, settings: Sequence[str], runs: int | None, seed: int | None) -> "Experiment":
+    """The scenario with the options' values; a mistake in one is told under the option's name."""
+    from hybridtrack.config import load
+
+    options = {"monte_carlo.runs": ("--runs", runs), "monte_carlo.seed": ("--seed", seed)}
+    given = {
+        f"{k}={value}": f"{o} {value}" for k, (o, value) in options.items() if value is not None
+    }
+    try:
+        return load(config, [*settings, *given])
+    except UserError as error:
+        sentence = str(error)
+        for setting, option in given.items():
+            sentence = sentence.replace(f"--set {setting}:", f"{option}:")
+        raise UserError(sentence) from None
+
+
+def _what_is_kept(folder: Path) -> str:
+    if any((folder / "shards").glob("*.npz")):
+        return f"; finished shards are kept in {folder}: the same command goes on there"
+    return "; no shard was finished yet: the same command starts anew"
+
+
+def _say_complete(folder: Path, asked: int) -> None:
+    from hybridtrack.results import require_complete
+
+    there = require_complete(folder)["runs"]
+    more = f"; it holds {there:,} runs, you asked for {asked:,}" if there != asked else ""
+    say(f"complete already: {folder} is shown, not repeated (--force repeats it){more}")
 
 
 def _say_if_compiling() -> None:
@@ -152,7 +227,9 @@ def _say_if_compiling() -> None:
 
 
 def draw_figures(folder: Path) -> list[Path]:
-    """Draw a finished run's figures from its tables alone."""
+    """Draw a finished run's figures from its tables alone, and note in its manifest which."""
+    import json as encoder
+
     from hybridtrack import figures, results
 
     manifest = results.require_complete(folder)
@@ -163,7 +240,19 @@ def draw_figures(folder: Path) -> list[Path]:
         modes=tuple(manifest["modes"]),
     )
     steps, tracks = (results.read_table(folder, name) for name in ("steps", "tracks"))
-    return figures.save(figures.draw(steps, tracks, information), folder / "figures")
+    paths = figures.save(figures.draw(steps, tracks, information), folder / "figures")
+    noted = manifest | {"figures": [path.name for path in paths]}
+    if noted != manifest and results.read_manifest(folder) == manifest:  # nobody went on meanwhile
+        results.write_text(folder / results.MANIFEST, encoder.dumps(noted, indent=2) + "\n")
+    return paths
+
+
+def figures_are_drawn(folder: Path) -> bool:
+    """Whether all figures of the tables as they are were drawn, and are still there."""
+    from hybridtrack.results import require_complete
+
+    names = require_complete(folder).get("figures")
+    return isinstance(names, list) and all((folder / "figures" / str(n)).exists() for n in names)
 
 
 def print_run(folder: Path, json: bool) -> None:
@@ -210,8 +299,12 @@ def init(
 def validate(
     config: Annotated[list[str], typer.Argument(help="Scenarios' files, or shipped ones' names.")],
 ) -> None:
-    """Check scenarios without running them; exit with 2 if one has a mistake."""
+    """Check scenarios without running them.
+
+    Exits with 2 if one has a mistake.
+    """
     from hybridtrack import config as scenarios
+    from hybridtrack.tables import counted
 
     mistakes = 0
     for one in config:
@@ -222,10 +315,10 @@ def validate(
             mistakes += 1
             continue
         steps = sum(len(case.times_s) - 1 for case in experiment.cases)
-        cases = len(experiment.cases)
         print(
-            f"{one}: ok ({cases} case{'s' * (cases > 1)}, {steps:,} steps, "
-            f"{experiment.runs:,} runs, {len(experiment.estimators)} estimators)"
+            f"{one}: ok ({counted(len(experiment.cases), 'case')}, {counted(steps, 'step')}, "
+            f"{counted(experiment.runs, 'run')}, "
+            f"{counted(len(experiment.estimators), 'estimator')})"
         )
     if mistakes:
         raise typer.Exit(2)
@@ -246,7 +339,7 @@ def list_(
         str | None, typer.Argument(help="One kind only: estimators, motions, ...")
     ] = None,
 ) -> None:
-    """List estimators, motion models, analyses, metrics and shipped scenarios."""
+    """List estimators, motions, metrics, shipped scenarios."""
     from hybridtrack.catalogue import catalogue
 
     kinds = catalogue()
@@ -276,7 +369,7 @@ def schema() -> None:
 def ledger(
     run_dir: Annotated[list[Path], typer.Argument(help="Finished run folders.")],
 ) -> None:
-    """Print the published figures and what became of them, as a Markdown table."""
+    """Print published figures and their verdicts in Markdown."""
     from hybridtrack.studies.ledger import markdown
 
     print(markdown(run_dir), end="")

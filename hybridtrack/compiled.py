@@ -9,6 +9,7 @@ import functools
 import hashlib
 import math
 import os
+import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ PACKAGE = Path(__file__).parent
 # the flags that assume there are none (nnan, ninf) are left off.
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 EXACT = {"contract"}
+KERNELS_MIB = 8  # 3 to 6 as compiled today
 
 
 @functools.cache
@@ -33,18 +35,48 @@ def source_digest() -> str:
 
 
 def _cache_folder() -> Path:
+    """The first folder that has room: the user's cache, the user's own among temporary files."""
+    for parent in (_user_cache, _user_temporary):
+        try:
+            folder = parent() / f"kernels-{source_digest()}"
+            folder.mkdir(parents=True, exist_ok=True)
+            if not any(folder.iterdir()):
+                _require_room(folder)
+            tempfile.TemporaryFile(dir=folder).close()
+            return folder
+        except (OSError, RuntimeError):  # RuntimeError: a user without a home
+            continue
+    return Path(tempfile.mkdtemp(prefix="hybridtrack-kernels-"))
+
+
+def _user_cache() -> Path:
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    folder = Path(base) if base else Path.home() / ".cache"
-    folder = folder / "hybridtrack" / f"kernels-{source_digest()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="hybridtrack-kernels-"))
+    return (Path(base) if base else Path.home() / ".cache") / "hybridtrack"
+
+
+def _user_temporary() -> Path:
+    """The same folder at every start; nobody else's, for machine code is run from it."""
+    if not hasattr(os, "getuid"):  # no shared folder of temporary files there
+        return Path(tempfile.gettempdir()) / "hybridtrack"
+    folder = Path(tempfile.gettempdir()) / f"hybridtrack-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if (found.st_uid, stat.S_IFMT(found.st_mode)) != (os.getuid(), stat.S_IFDIR):
+        raise PermissionError(f"{folder} belongs to someone else")
+    if stat.S_IMODE(found.st_mode) & 0o022:
+        raise PermissionError(f"{folder} can be written by others")
     return folder
 
 
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
+def _require_room(folder: Path) -> None:
+    """Numba gives up with a traceback where its files don't fit: raise OSError before that."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        for _ in range(KERNELS_MIB):
+            file.write(bytes(1 << 20))
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    os.environ["NUMBA_CACHE_DIR"] = str(_cache_folder())
 
 import numba  # noqa: E402  (the cache folder must be known before)
 from numba import types  # noqa: E402
@@ -121,7 +153,7 @@ def _exp(x: float) -> float:
 
 
 def _log(x: float) -> float:
-    """Natural logarithm for x >= 0 (log 0 = -inf), to about one unit in the last place.
+    """Natural logarithm for finite x >= 0 (log 0 = -inf), to about one unit in the last place.
 
     log(m) = 2 atanh((m - 1)/(m + 1)) for the mantissa in [sqrt(1/2), sqrt(2)); the series'
     remainder after eleven terms is below 1e-17. Branch-free like `exp`.

@@ -145,6 +145,12 @@ def broken_at_gaps(time: Array, *columns: Array) -> list[Array]:
     return [np.insert(column, places, np.nan) for column in (time, *columns)]
 
 
+def isolated(values: Array) -> Any:
+    """Which known values have no known neighbour, so that a line through them shows nothing."""
+    known = np.pad(np.isfinite(values), 1)
+    return known[1:-1] & ~known[:-2] & ~known[2:]
+
+
 def read_paths(one: pd.DataFrame, plane: bool) -> dict[str, Array]:
     """(x, y), or (time, x) without a plane, (2, n_steps), of everything that has a position."""
     paths = {}

@@ -71,27 +71,37 @@ def default_folder(experiment: Experiment, root: Path = Path("runs")) -> Path:
 
 
 def is_complete(path: Path, experiment: Experiment) -> bool:
-    """Whether a folder holds this experiment, finished, with as many runs or more."""
-    manifest = results.read_manifest(path)
+    """Whether a folder holds this experiment, finished, with as many runs or more.
+
+    So it does while a longer one is under way, or was interrupted. Raises UserError where the
+    folder's manifest is damaged.
+    """
+    manifest = results.read_finished(path)
     return (
         manifest is not None
-        and manifest.get("status") == results.COMPLETE
-        and manifest.get("digest") == digest(experiment)
-        and manifest.get("runs", 0) >= experiment.runs
+        and manifest["digest"] == digest(experiment)
+        and bool(manifest["runs"] >= experiment.runs)
     )
 
 
 def run(experiment: Experiment, path: Path, workers: int, report: Report) -> None:
     """Run an experiment into its folder, going on from whatever shards are there.
 
-    Nothing already written is lost on the way: the tables of a shorter run stay until those of
-    this one replace them.
+    Nothing already written is lost on the way: the result of a shorter run stays, and counts as
+    finished, until this one's replaces it; that of a longer run stays for good.
     """
     shards = plan(experiment)
     with RunFolder(path, digest(experiment)) as folder:
         manifest = _manifest(experiment)
-        folder.write_manifest(manifest)
-        results.write_text(path / "config.yaml", dump(experiment.resolved))
+        held = results.read_finished(path)
+        if held is None:
+            folder.write_manifest(manifest)
+            results.write_text(path / results.CONFIG, dump(experiment.resolved))
+        elif held["runs"] > experiment.runs:
+            return
+        else:
+            under_way = {name: manifest[name] for name in ("runs", "started")}
+            folder.write_manifest({**held, "under_way": under_way})
         cases: dict[int, GroupStatistics] = {}
         tracks: list[tuple[int, Track]] = []
         for shard, group, kept in _shard_statistics(experiment, folder, shards, workers, report):
@@ -101,15 +111,14 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
         names = [shard.name for shard in shards]
         n_cells = len(outcomes.labels(experiment)) * len(experiment.windows)
         folder.assemble_runs(names, n_cells)
-        folder.drop_parts(names)
         merged = [cases[c] for c in range(len(experiment.cases))]
         folder.write_table("steps", outcomes.steps_rows(experiment, merged))
         folder.write_table("tracks", outcomes.tracks_rows(experiment, tracks))
         folder.write_table("summary", outcomes.summary_rows(experiment, merged))
-        folder.write_table("comparisons", outcomes.comparisons_rows(experiment, path))
-        folder.write_table("published", outcomes.published_rows(experiment, path, merged))
+        into = folder.unfinished
+        folder.write_table("comparisons", outcomes.comparisons_rows(experiment, into))
+        folder.write_table("published", outcomes.published_rows(experiment, into, merged))
         manifest |= {
-            "status": results.COMPLETE,
             "finished": _now(),
             "diverged": {
                 label: count
@@ -117,7 +126,9 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
                 if (count := sum(group.diverged[label] for group in merged))
             },
         }
-        folder.write_manifest(manifest)
+        results.write_text(into / results.CONFIG, dump(experiment.resolved))
+        folder.publish(manifest)
+        folder.drop_parts(names)
 
 
 def plan(experiment: Experiment) -> list[Shard]:
@@ -156,7 +167,7 @@ def _shard_statistics(
     try:
         for shard in shards:
             if shard.name in at_hand:
-                group, tracks = _unpack(folder.load_shard(shard.name))
+                group, tracks = folder.load_shard(shard.name, _unpack)
                 done += shard.runs
                 report(done, total)
             else:

@@ -26,6 +26,7 @@ from hybridtrack.curves import (
     Curve,
     Truth,
     broken_at_gaps,
+    isolated,
     mode_names,
     read_curves,
     read_paths,
@@ -192,14 +193,16 @@ def _draw_trajectory(
 def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> None:
     if "measurement" in paths:
         label, colour, _ = looks["raw"]
-        ax.plot(
-            *paths["measurement"], ".", color=colour, markersize=3.5, markeredgewidth=0, label=label
-        )
+        # Crosses wider than the truth, which would hide dots; too many would hide the lines.
+        above = 3 if paths["measurement"].shape[1] <= 500 else 1
+        cross: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0.5, "zorder": above}
+        ax.plot(*paths["measurement"], "+", color=colour, label=label, **cross)
     if "truth" in paths:
         truth = paths["truth"]
-        start = truth[:, np.isfinite(truth).all(axis=0)][:, 0]
+        first = truth[:, np.isfinite(truth).all(axis=0)][:, 0]
         ax.plot(*truth, color=TRUTH_COLOUR, linewidth=2.2, label="truth")
-        ax.plot(*start, "o", color=TRUTH_COLOUR, markerfacecolor="white", zorder=5, label="start")
+        ring: dict[str, Any] = {"color": TRUTH_COLOUR, "markerfacecolor": "white", "zorder": 5}
+        ax.plot(*first, "o", label="first scan", **ring)
     for name, look in looks.items():
         if name in paths:
             _plot_line(ax, paths[name][0], paths[name][1], look)
@@ -325,19 +328,21 @@ def _over(curves: Iterable[Curve], runs: int) -> str:
 
 
 def _plot_curve(ax: Axes, curve: Curve, look: Look) -> None:
-    """The curve and its band of two standard errors on either side."""
+    """The curve and two standard errors on either side: a band, or a bar without neighbours."""
     time, value, error = broken_at_gaps(curve.time, curve.value, curve.standard_error)
     _plot_line(ax, time, value, look)
     low, high = value - 2 * error, value + 2 * error
     ax.fill_between(time, low, high, color=look.colour, alpha=0.2, linewidth=0)
+    bars = isolated(low + high)  # a band has no width at one point
+    if bars.any():
+        ax.vlines(time[bars], low[bars], high[bars], look.colour, alpha=0.5, linewidth=0.8)
 
 
 def _plot_line(ax: Axes, x: Array, y: Array, look: Look) -> None:
     """A line broken at NaN; a point without neighbours, which a line would lose, gets a dot."""
     width = 1.3 if len(x) <= 500 else 0.8
     ax.plot(x, y, color=look.colour, linestyle=look.dashes, linewidth=width, label=look.label)
-    known = np.pad(np.isfinite(x + y), 1)
-    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    alone = isolated(x + y)
     if alone.any():
         ax.plot(x[alone], y[alone], ".", color=look.colour, markersize=3)
 

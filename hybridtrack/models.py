@@ -77,6 +77,13 @@ class ModeBank(NamedTuple):
         """The modes' names, in the scenario's order."""
         return tuple(mode.name for mode in self.modes)
 
+    @property
+    def mean_measurement_noise(self) -> Array:
+        """R (n_y, n_y) expected over the modes as they are at the start."""
+        covariances = np.stack([mode.measurement_noise_covariance for mode in self.modes])
+        mean: Array = np.einsum("j,jml->ml", self.initial_mode_probabilities, covariances)
+        return mean
+
     def discretise(
         self, step_s: Array, initial_mean: Array, initial_covariance: Array
     ) -> JumpMarkovModel:

@@ -1,6 +1,7 @@
 """From merged statistics to the rows of a run folder's tables, verdicts among them."""
 
 import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,16 @@ from hybridtrack.blocks import RAW, GroupStatistics, Track
 from hybridtrack.config import Experiment
 from hybridtrack.statistics import (
     METRICS,
+    POSITION,
+    POSITION_AT_SCANS,
     Estimate,
     Metric,
     Paired,
+    PairMoments,
     RunSums,
     compare,
+    merge_pairs,
+    pair_moments,
     ratio_of_sums,
 )
 from hybridtrack.verdicts import Claim, Outcome, judge_comparison, judge_figure
@@ -102,17 +108,34 @@ def _columns(table: str, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
-def _runs(path: Path, label: str, window: str) -> dict[str, RunSums]:
-    """The runs of an estimator in a window, by quantity."""
-    sums, case, status = results.read_run_sums(path, label, window)
-    return {q: RunSums(case, s, n, status == 0) for q, (s, n) in sums.items()}
-
-
 def paired(path: Path, first: str, second: str, metric: str, window: str) -> Paired:
-    """Two estimators of a run folder compared over the same runs."""
-    quantity, root = METRICS[metric].quantity, METRICS[metric].root
-    return compare(
-        _runs(path, first, window)[quantity], _runs(path, second, window)[quantity], root
+    """Two estimators of a run folder compared over the same runs (and scans, if one is raw)."""
+    return _paired(path, first, second, window, [metric])[metric]
+
+
+def _paired(
+    path: Path, first: str, second: str, window: str, metrics: Iterable[str]
+) -> dict[str, Paired]:
+    """Comparisons by metric; memory holds the runs of one shard at a time."""
+    quantities = {metric: METRICS[metric].quantity for metric in metrics}
+    if RAW in (first, second):  # there is a measurement only where the scan isn't missed
+        exchanged = {POSITION: POSITION_AT_SCANS}
+        quantities = {m: exchanged.get(q, q) for m, q in quantities.items()}
+    pairs: dict[str, dict[int, PairMoments]] = {q: {} for q in quantities.values()}
+    shards = [results.run_sums(path, label, window) for label in (first, second)]
+    for one, two in zip(*shards, strict=True):
+        for quantity in pairs:
+            moments = pair_moments(_run_sums(one, quantity), _run_sums(two, quantity))
+            pairs[quantity] = merge_pairs(pairs[quantity], moments)
+    return {m: compare(pairs[q], METRICS[m].root) for m, q in quantities.items()}
+
+
+def _run_sums(columns: Mapping[str, Any], quantity: str) -> RunSums:
+    return RunSums(
+        case=columns["case_number"],
+        sums=columns[f"{quantity}_sum"],
+        numbers=columns[f"{quantity}_count"],
+        sound=columns["status"] == 0,
     )
 
 
@@ -122,15 +145,14 @@ def comparisons_rows(experiment: Experiment, path: Path) -> dict[str, Any]:
     second = experiment.compare_with
     for window in experiment.windows if second is not None else ():
         assert second is not None
-        other = _runs(path, second, window.name)
         for first in labels(experiment):
-            one = _runs(path, first, window.name) if first != second else {}
-            for name, metric in METRICS.items() if one else ():
-                pair = compare(one[metric.quantity], other[metric.quantity], metric.root)
+            if first == second:
+                continue
+            for metric, pair in _paired(path, first, second, window.name, METRICS).items():
                 n = pair.difference.n_runs
                 if n:
                     figures = (*pair.difference[:2], *pair.ratio[:2], n)
-                    rows.append((first, second, name, window.name, *figures))
+                    rows.append((first, second, metric, window.name, *figures))
     return _columns("comparisons", rows)
 
 

@@ -1,16 +1,16 @@
 """Progress on stderr: a bar on a terminal, a few plain lines elsewhere."""
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 QUIET_S = 5.0  # plain lines come no closer than this
 
 Report = Callable[[int, int], None]
 
 
-@contextmanager
+@contextlib.contextmanager
 def progress(quiet: bool) -> Iterator[Report]:
     """A callback for (runs done, runs in all)."""
     if quiet:
@@ -47,6 +47,7 @@ def _lines() -> Report:
         if now - last >= QUIET_S and done < total:
             last = now
             left = (now - begun) * (total - done) / done
-            print(f"{done:,} of {total:,} runs, {left:.0f} s left", file=sys.stderr, flush=True)
+            with contextlib.suppress(OSError):  # nobody listens: no reason to stop
+                print(f"{done:,} of {total:,} runs, {left:.0f} s left", file=sys.stderr, flush=True)
 
     return report

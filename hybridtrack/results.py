@@ -3,18 +3,19 @@
 Everything is written under a temporary name and moved into place. Tables hold nothing that says
 when or where; the manifest says it. While a run is under way `shards/` holds the statistics of
 every finished shard (a fixed number of blocks of one case), so that a killed run goes on where it
-stopped, and a finished one can be continued to more runs.
+stopped, and a finished one can be continued to more runs: its result stays as it is until the
+longer one's, put together in `unfinished/`, replaces it. Only files named here are ever removed.
 """
 
 import contextlib
 import json
 import os
-import shutil
+import re
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -22,85 +23,43 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from hybridtrack.columns import SCHEMAS as SCHEMAS
 from hybridtrack.errors import UserError
 
 MANIFEST = "manifest.json"
 RUNNING, COMPLETE = "running", "complete"
+CONFIG, CSV = "config.yaml", "summary.csv"
 LOCK, PART = ".lock", ".part"
+SHARDS, UNFINISHED, FIGURES = "shards", "unfinished", "figures"
+SHARD_NAME = re.compile(r"(?P<place>\d{4,}-\d{6,})-(?P<runs>\d+)")  # place: case and first block
+PART_NAME = re.compile(r"\..+\.\d+\.part(ial)?")
+FIGURE_NAME = re.compile(
+    r"(trajectory|(position|velocity)_error|mode_(probability|likelihood))(-.+)?\.png"
+)
+FINISHED: dict[str, type | tuple[type, ...]] = {  # what a finished run's manifest is asked for
+    "name": str,
+    "title": str,
+    "seed": int,
+    "runs": int,
+    "cases": int,
+    "estimators": list,
+    "modes": list,
+    "windows": list,
+    "compare_with": (str, type(None)),
+    "diverged": dict,
+}
 DAMAGE = (
     OSError,
     ValueError,
     EOFError,
-    KeyError,
+    LookupError,
+    TypeError,
     zipfile.BadZipFile,
     zlib.error,
     pa.ArrowException,
 )
 Array = NDArray[Any]
-
-SCHEMAS = {
-    "summary": pa.schema(
-        [
-            ("estimator", pa.string()),
-            ("metric", pa.string()),
-            ("window", pa.string()),
-            ("value", pa.float64()),
-            ("standard_error", pa.float64()),
-            ("n_runs", pa.int64()),
-        ]
-    ),
-    "steps": pa.schema(
-        [
-            ("case", pa.string()),
-            ("estimator", pa.string()),
-            ("step", pa.int32()),
-            ("time_s", pa.float64()),
-            ("metric", pa.string()),
-            ("value", pa.float64()),
-            ("standard_error", pa.float64()),
-        ]
-    ),
-    "comparisons": pa.schema(
-        [
-            ("first", pa.string()),
-            ("second", pa.string()),
-            ("metric", pa.string()),
-            ("window", pa.string()),
-            ("difference", pa.float64()),
-            ("difference_standard_error", pa.float64()),
-            ("ratio", pa.float64()),
-            ("ratio_standard_error", pa.float64()),
-            ("n_pairs", pa.int64()),
-        ]
-    ),
-    "published": pa.schema(
-        [
-            ("claim", pa.string()),
-            ("estimator", pa.string()),
-            ("metric", pa.string()),
-            ("window", pa.string()),
-            ("published", pa.float64()),
-            ("sign", pa.string()),
-            ("ours", pa.float64()),
-            ("standard_error", pa.float64()),
-            ("verdict", pa.string()),
-            ("expected_verdict", pa.string()),
-            ("differs", pa.bool_()),
-            ("because", pa.string()),
-        ]
-    ),
-    "tracks": pa.schema(
-        [
-            ("case", pa.string()),
-            ("run", pa.int64()),
-            ("estimator", pa.string()),
-            ("step", pa.int32()),
-            ("time_s", pa.float64()),
-            ("quantity", pa.string()),
-            ("value", pa.float64()),
-        ]
-    ),
-}
+Content = TypeVar("Content")
 
 
 @contextlib.contextmanager
@@ -126,6 +85,13 @@ def _reason(error: OSError) -> str:
     return (error.strerror or str(error)).lower()
 
 
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made ({_reason(error)})") from None
+
+
 class RunFolder:
     """A run's folder, opened for writing by one process at a time."""
 
@@ -133,10 +99,7 @@ class RunFolder:
         """Makes the folder. Raises UserError where it holds anything else than this run."""
         self.path = path
         self.digest = digest
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{path}: cannot be made ({_reason(error)})") from None
+        _make(path)
         manifest = read_manifest(path)
         if manifest is None and _holds_something(path):
             raise UserError(f"{path}: this folder holds something else; name another with --out")
@@ -145,26 +108,28 @@ class RunFolder:
                 f"{path}: this folder holds another run ({manifest.get('name')}, digest "
                 f"{manifest.get('digest')}); name another with --out, or add --force"
             )
+        self.unfinished = path / UNFINISHED  # the tables, until publish
         self._lock = contextlib.ExitStack()
         self._assembled: list[str] = []  # shards whose runs runs.parquet holds, in its order
 
     def __enter__(self) -> "RunFolder":
         with contextlib.ExitStack() as stack:
             stack.enter_context(_locked(self.path / LOCK))
-            for part in self.path.glob(f".*{PART}"):  # of a killed process
-                part.unlink(missing_ok=True)
+            _remove(self.path, PART_NAME.fullmatch)  # of a killed process
+            _remove(self.unfinished, _is_table)
             self._assembled = _shards_in(self.path / "runs.parquet")
             self._lock = stack.pop_all()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._lock.close()
+        with self._lock:
+            _remove(self.unfinished, _is_table)
 
     # ---- shards ----
 
     @property
     def _shards(self) -> Path:
-        return self.path / "shards"
+        return self.path / SHARDS
 
     def has_shard(self, name: str) -> bool:
         """Whether the statistics and the runs of a shard are at hand."""
@@ -178,10 +143,7 @@ class RunFolder:
         cells: a table of runs per estimator and window, always in the same order; each becomes a
         row group, so that one can be read without the others.
         """
-        try:
-            self._shards.mkdir(exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{self._shards}: cannot be made ({_reason(error)})") from None
+        _make(self._shards)
         with (
             replacing(self._shards / f"{name}.parquet") as temporary,
             pq.ParquetWriter(temporary, cells[0].schema, compression="zstd") as writer,
@@ -191,59 +153,117 @@ class RunFolder:
         with replacing(self._shards / f"{name}.npz") as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
 
-    def load_shard(self, name: str) -> dict[str, Any]:
-        """The arrays of a shard. Raises UserError where the file is damaged."""
+    def load_shard(self, name: str, unpack: Callable[[dict[str, Any]], Content]) -> Content:
+        """What `unpack` makes of a shard's arrays. Raises UserError where the file is damaged."""
         path = self._shards / f"{name}.npz"
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                return {key: archive[key] for key in archive.files}
+                return unpack({key: archive[key] for key in archive.files})
         except DAMAGE as error:
             raise _damaged(path, error) from None
 
     def assemble_runs(self, names: list[str], n_cells: int) -> None:
-        """runs.parquet from the shards' row groups; memory holds one of these at a time.
+        """The next runs.parquet from the shards' row groups; memory holds one at a time.
 
         The file says which shards it holds, so that it can be gone on from whenever this process
         is killed.
         """
-        target = self.path / "runs.parquet"
-        with replacing(target) as temporary, contextlib.ExitStack() as stack:
+        present = self.path / "runs.parquet"
+        _make(self.unfinished)
+        with (
+            replacing(self.unfinished / "runs.parquet") as temporary,
+            contextlib.ExitStack() as stack,
+        ):
             writer: pq.ParquetWriter | None = None
             for name in names:
                 source, first = self._shards / f"{name}.parquet", 0
                 if not source.exists():
-                    source, first = target, n_cells * self._assembled.index(name)
+                    source, first = present, n_cells * self._assembled.index(name)
                 for table in _row_groups(source, first, n_cells):
                     if writer is None:
                         schema = table.schema.with_metadata({"shards": json.dumps(names)})
                         writer = pq.ParquetWriter(temporary, schema, compression="zstd")
                         stack.callback(writer.close)
+                    elif not table.schema.equals(writer.schema):
+                        raise _damaged(source, ValueError("other columns than the rest"))
                     writer.write_table(table)
 
     def drop_parts(self, names: list[str]) -> None:
-        """Remove what runs.parquet now holds, and shards that are no part of this run."""
-        for path in self._shards.iterdir():
-            if path.suffix != ".npz" or path.stem not in names:
-                path.unlink(missing_ok=True)
+        """Remove what runs.parquet now holds, and shards that have grown.
+
+        Those beyond this run, or longer than its own, stay: of a longer one that was interrupted.
+        """
+        held = {m["place"]: int(m["runs"]) for name in names if (m := SHARD_NAME.fullmatch(name))}
+
+        def is_done_with(name: str) -> bool:
+            stem, _, suffix = name.partition(".")
+            shard = SHARD_NAME.fullmatch(stem)
+            if PART_NAME.fullmatch(name) or (stem in names and suffix == "parquet"):
+                return True
+            return shard is not None and int(shard["runs"]) < held.get(shard["place"], 0)
+
+        _remove(self._shards, is_done_with)
 
     # ---- tables and the manifest ----
 
     def write_table(self, name: str, rows: Mapping[str, Any]) -> None:
-        """One of TABLES from columns (empty ones too)."""
+        """One of SCHEMAS from columns (empty ones too), for `publish`."""
         table = pa.table(dict(rows), schema=SCHEMAS[name])
-        with replacing(self.path / f"{name}.parquet") as temporary:
+        _make(self.unfinished)
+        with replacing(self.unfinished / f"{name}.parquet") as temporary:
             pq.write_table(table, temporary, compression="zstd")
         if name == "summary":
-            write_text(self.path / "summary.csv", table.to_pandas().to_csv(index=False))
+            write_text(self.unfinished / CSV, table.to_pandas().to_csv(index=False))
 
     def write_manifest(self, manifest: Mapping[str, Any]) -> None:
         """manifest.json; `status` tells whether everything else is there."""
         write_text(self.path / MANIFEST, json.dumps(manifest, indent=2) + "\n")
 
+    def publish(self, manifest: Mapping[str, Any]) -> None:
+        """Put the unfinished files in the place of those that are there; the manifest last."""
+        self.write_manifest({**manifest, "status": RUNNING})  # old and new are mixed for a moment
+        try:
+            for file in sorted(self.unfinished.iterdir()):
+                file.replace(self.path / file.name)
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written ({_reason(error)})") from None
+        self.write_manifest({**manifest, "status": COMPLETE})
+
 
 def _holds_something(path: Path) -> bool:
     """Whether a folder without a manifest holds more than a killed run's first files."""
-    return any(p.name != LOCK and not p.name.endswith(PART) for p in path.iterdir())
+    try:
+        return any(p.name != LOCK and not PART_NAME.fullmatch(p.name) for p in path.iterdir())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({_reason(error)})") from None
+
+
+def _is_table(name: str) -> bool:
+    """Whether a file of this name is one that `publish` moves, or a part of one."""
+    tables = {f"{table}.parquet" for table in (*SCHEMAS, "runs")}
+    return name in tables | {CSV, CONFIG} or PART_NAME.fullmatch(name) is not None
+
+
+def _is_shard(name: str) -> bool:
+    stem, _, suffix = name.partition(".")
+    shard = SHARD_NAME.fullmatch(stem) and suffix in ("npz", "parquet")
+    return bool(shard or PART_NAME.fullmatch(name))
+
+
+def _is_figure(name: str) -> bool:
+    return bool(FIGURE_NAME.fullmatch(name) or PART_NAME.fullmatch(name))
+
+
+def _remove(folder: Path, is_ours: Callable[[str], object]) -> None:
+    """Remove a folder's files of the given names, and the folder if nothing else was in it."""
+    try:
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if is_ours(path.name) and not path.is_dir():
+                path.unlink()
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be cleared ({_reason(error)})") from None
 
 
 def _damaged(path: Path, error: Exception) -> UserError:
@@ -258,8 +278,8 @@ def _missing(path: Path) -> UserError:
 def _shards_in(path: Path) -> list[str]:
     """The shards whose runs a runs.parquet holds; none where there is no such file."""
     try:
-        names: list[str] = json.loads((pq.read_schema(path).metadata or {})[b"shards"])
-        return names
+        names = json.loads((pq.read_schema(path).metadata or {})[b"shards"])
+        return [str(name) for name in names]
     except FileNotFoundError:
         return []
     except DAMAGE as error:
@@ -301,44 +321,64 @@ def clear(path: Path, digest: str) -> None:
     Whatever else is in it stays, and the folder is then the given run's. Raises UserError where
     it isn't a run folder, or in use.
     """
-    if not path.exists():
+    manifest = read_manifest(path)
+    if not path.is_dir():
         return
-    if read_manifest(path) is None and _holds_something(path):
+    if manifest is None and _holds_something(path):
         raise UserError(f"{path}: this is no run folder, so it isn't cleared; name another")
     _locked(path / LOCK).close()  # nobody is writing it
-    try:
-        for pattern in ("shards", "figures/*.png", "*.parquet", "*.part", "summary.csv"):
-            for found in path.glob(pattern):
-                shutil.rmtree(found) if found.is_dir() else found.unlink()
-        for name in ("config.yaml", LOCK, MANIFEST):
-            (path / name).unlink(missing_ok=True)
-        for folder in (path / "figures", path):
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
-        if path.exists():
-            begun = {"status": RUNNING, "digest": digest}
-            write_text(path / MANIFEST, json.dumps(begun) + "\n")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be cleared ({_reason(error)})") from None
+    for folder, is_ours in ((SHARDS, _is_shard), (FIGURES, _is_figure), (UNFINISHED, _is_table)):
+        _remove(path / folder, is_ours)
+    _remove(path, lambda name: _is_table(name) or name in (LOCK, MANIFEST))
+    if path.exists():
+        write_text(path / MANIFEST, json.dumps({"status": RUNNING, "digest": digest}) + "\n")
 
 
 def read_manifest(path: Path) -> dict[str, Any] | None:
-    """The manifest of a run folder; None where there is none. Raises UserError if damaged."""
+    """The manifest of a run folder, begun or finished; None where there is none, or another's.
+
+    Raises UserError where it cannot be read.
+    """
+    file = path / MANIFEST
     try:
-        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path / MANIFEST}: cannot be read ({error}); remove the folder") from None
-    return manifest if isinstance(manifest, dict) else None
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({_reason(error)})") from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(
+            f"{file}: this is no run's manifest ({error}); name another folder, or move this file "
+            "out of the way"
+        ) from None
+    ours = (
+        isinstance(manifest, dict)
+        and manifest.get("status") in (RUNNING, COMPLETE)
+        and isinstance(manifest.get("digest"), str)
+    )
+    return manifest if ours else None
+
+
+def read_finished(path: Path) -> dict[str, Any] | None:
+    """The manifest of a finished run, which may be under way to more runs; None where it isn't.
+
+    Raises UserError where it is damaged.
+    """
+    manifest = read_manifest(path)
+    if manifest is None or manifest["status"] != COMPLETE:
+        return None
+    for key, kind in FINISHED.items():
+        if key not in manifest or not isinstance(manifest[key], kind):
+            raise _damaged(path / MANIFEST, ValueError(f"no {key} as a run writes it"))
+    return manifest
 
 
 def require_complete(path: Path) -> dict[str, Any]:
     """The manifest of a finished run. Raises UserError where there is none."""
-    manifest = read_manifest(path) if path.is_dir() else None
-    if manifest is None:
+    if read_manifest(path) is None:
         raise UserError(f"{path}: this is no run folder; name one that `hybridtrack run` printed")
-    if manifest.get("status") != COMPLETE:
+    manifest = read_finished(path)
+    if manifest is None:
         raise UserError(f"{path}: this run isn't complete; run its scenario again to finish it")
     return manifest
 
@@ -347,41 +387,41 @@ def read_table(path: Path, name: str) -> pd.DataFrame:
     """A table of a run folder. Raises UserError where it is missing or damaged."""
     file = path / f"{name}.parquet"
     try:
-        table: pd.DataFrame = pq.read_table(file).to_pandas()
-        return table
+        table = pq.read_table(file)
+        if name in SCHEMAS and not table.schema.remove_metadata().equals(SCHEMAS[name]):
+            raise ValueError(f"not the columns of {name}")
+        frame: pd.DataFrame = table.to_pandas()
+        return frame
     except FileNotFoundError:
         raise _missing(file) from None
     except DAMAGE as error:
         raise _damaged(file, error) from None
 
 
-def read_run_sums(
-    path: Path, estimator: str, window: str
-) -> tuple[dict[str, tuple[Array, Array]], Array, Array]:
-    """One estimator's runs in one window, in the order of cases and runs.
+def run_sums(path: Path, estimator: str, window: str) -> Iterator[dict[str, Array]]:
+    """One estimator's runs in one window, shard by shard, in the order of cases and runs.
 
-    Gives by quantity (sums, numbers), each (n_runs,), then the case numbers and the statuses.
+    Each is case_number, status, and QUANTITY_sum and QUANTITY_count, arrays (n_runs,).
     """
-    parts: list[pa.Table] = []
     path = path / "runs.parquet"
+    found = False
     try:
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
             place = [names.index(name) for name in ("estimator", "window")]
+            numbers = [name for name in names if name.endswith(("_number", "_sum", "_count"))]
             for group in range(file.num_row_groups):
                 columns = [file.metadata.row_group(group).column(i).statistics for i in place]
                 if [column.min for column in columns] == [estimator, window]:
-                    parts.append(file.read_row_group(group))
+                    found = True
+                    table = file.read_row_group(group, columns=[*numbers, "status"])
+                    yield {name: _column(table, name) for name in table.column_names}
     except FileNotFoundError:
         raise _missing(path) from None
     except DAMAGE as error:
         raise _damaged(path, error) from None
-    if not parts:
+    if not found:
         raise UserError(f"{path}: holds no estimator '{estimator}' with a window '{window}'")
-    table = pa.concat_tables(parts)
-    quantities = [name.removesuffix("_sum") for name in names if name.endswith("_sum")]
-    sums = {q: (_column(table, f"{q}_sum"), _column(table, f"{q}_count")) for q in quantities}
-    return sums, _column(table, "case_number"), _column(table, "status")
 
 
 def _column(table: pa.Table, name: str) -> Array:

@@ -65,7 +65,9 @@ METRICS: Mapping[str, Metric] = {
 
 ROUNDING = 1e-9  # likelihoods sum to 1; two filters that are one in theory differ by less
 
-QUANTITIES = tuple(dict.fromkeys(metric.quantity for metric in METRICS.values()))
+# The position error at the scans that were not missed: what compares with the measurements.
+POSITION, POSITION_AT_SCANS = "position_squared_error_m2", "position_squared_error_at_scans_m2"
+QUANTITIES = (*dict.fromkeys(metric.quantity for metric in METRICS.values()), POSITION_AT_SCANS)
 
 
 # ---- one span scored -------------------------------------------------------------------------
@@ -111,21 +113,21 @@ def score_measurements(scans: Scans, truth_states: tuple[str, ...]) -> dict[str,
     """The raw measurements' own error, by the quantities that they have."""
     states = tuple("xyz"[: scans.measurements.shape[1]])
     error = squared_error(scans.truth.state, truth_states, scans.measurements, states, "")
-    return {} if error is None else {"position_squared_error_m2": error}
+    return {} if error is None else {POSITION: error, POSITION_AT_SCANS: error}
 
 
 def score(scans: Scans, estimates: Estimates, names: Names) -> Scores:
     """Quantities of a span of estimates, by name; absent where the names don't carry them."""
     quantities: dict[str, Array] = {}
-    for kind, quantity in (
-        ("", "position_squared_error_m2"),
-        ("v", "velocity_squared_error_m2_s2"),
-    ):
+    for kind, quantity in (("", POSITION), ("v", "velocity_squared_error_m2_s2")):
         error = squared_error(
             scans.truth.state, names.truth_states, estimates.mean, names.states, kind
         )
         if error is not None:
             quantities[quantity] = error
+    if POSITION in quantities:
+        missed = np.isnan(scans.measurements).any(axis=1)
+        quantities[POSITION_AT_SCANS] = np.where(missed, np.nan, quantities[POSITION])
     if len(names.modes) < 2:
         return Scores(quantities, None)
     steps, _, lanes = estimates.mode_probabilities.shape
@@ -353,38 +355,80 @@ class Paired(NamedTuple):
     ratio: Estimate  # first / second
 
 
-def compare(first: RunSums, second: RunSums, root: bool) -> Paired:
-    """Difference and ratio of a metric over the same runs, with paired standard errors."""
+class PairMoments(NamedTuple):
+    """Moments over runs of (S1, N1, S1 - S2, N1 - N2): sums and numbers of steps of two.
+
+    The differences stand for the second estimator, so that two alike have an error of exactly 0.
+    """
+
+    n: float
+    mean: Array  # (4,)
+    products: Array  # (4, 4) sums of products of deviations
+
+
+def pair_moments(first: RunSums, second: RunSums) -> dict[int, PairMoments]:
+    """Moments of a pair by case; a run that diverged under either is left out of both."""
     both = first.sound & second.sound & (first.numbers > 0) & (second.numbers > 0)
-    n = int(both.sum())
+    found = {}
+    for case in np.unique(first.case[both]).tolist():
+        runs = both & (first.case == case)
+        s, m = first.sums[runs], first.numbers[runs]
+        values = np.stack([s, m, s - second.sums[runs], m - second.numbers[runs]])
+        mean = values.mean(axis=1)
+        deviations = values - mean[:, np.newaxis]
+        found[case] = PairMoments(float(s.size), mean, deviations @ deviations.T)
+    return found
+
+
+def merge_pairs(a: dict[int, PairMoments], b: dict[int, PairMoments]) -> dict[int, PairMoments]:
+    """Both together, case by case (Chan's merging)."""
+    merged = dict(a)
+    for case, y in b.items():
+        if case in merged:
+            x = merged[case]
+            n, step = x.n + y.n, y.mean - x.mean
+            products = x.products + y.products + x.n * y.n / n * np.outer(step, step)
+            merged[case] = PairMoments(n, x.mean + y.n / n * step, products)
+        else:
+            merged[case] = y
+    return merged
+
+
+def compare(pairs: Mapping[int, PairMoments], root: bool) -> Paired:
+    """Difference and ratio of a metric over the same runs, with paired standard errors.
+
+    By the delta method; cases are strata.
+    """
+    n = sum(pair.n for pair in pairs.values())
     if n == 0:
         return Paired(math.nan, math.nan, NOTHING, NOTHING)
-    case = first.case[both]
-    value_1, influence_1 = _influence(first.sums[both], first.numbers[both], root)
-    value_2, influence_2 = _influence(second.sums[both], second.numbers[both], root)
-    difference = Estimate(value_1 - value_2, _stratified_error(influence_1 - influence_2, case), n)
+    s, m, ds, dm = np.sum([pair.n * pair.mean for pair in pairs.values()], axis=0) / n
+    value_1, slope_1 = _metric(float(s), float(m), root)
+    value_2, slope_2 = _metric(float(s - ds), float(m - dm), root)
+
+    def error(weight_1: float, weight_2: float) -> float:
+        """Standard error of weight_1 first + weight_2 second."""
+        one, two = weight_1 * slope_1, weight_2 * slope_2
+        coefficients = np.concatenate([one + two, -two])
+        variance = 0.0
+        for pair in pairs.values():
+            spread = max(float(coefficients @ pair.products @ coefficients), 0.0)
+            variance += pair.n * spread / (pair.n - 1) if pair.n > 1 else math.nan
+        return math.sqrt(variance) / n
+
+    difference = Estimate(value_1 - value_2, error(1.0, -1.0), round(n))
     if value_2 == 0.0:
         return Paired(value_1, value_2, difference, NOTHING)
     ratio = value_1 / value_2
-    relative = (influence_1 - ratio * influence_2) / value_2
-    return Paired(
-        value_1, value_2, difference, Estimate(ratio, _stratified_error(relative, case), n)
-    )
+    relative = error(1.0 / value_2, -ratio / value_2)
+    return Paired(value_1, value_2, difference, Estimate(ratio, relative, round(n)))
 
 
-def _influence(sums: Array, numbers: Array, root: bool) -> tuple[float, Array]:
-    """The metric and each run's influence on it, whose mean is 0."""
-    ratio = float(sums.sum() / numbers.sum())
-    influence = (sums - ratio * numbers) / numbers.mean()
+def _metric(total: float, number: float, root: bool) -> tuple[float, Array]:
+    """The metric of mean sum and mean number, and its derivatives by them."""
+    ratio = total / number
+    slope = np.array([1.0, -ratio]) / number
     if not root:
-        return ratio, influence
+        return ratio, slope
     value = math.sqrt(ratio)
-    return value, influence / (2 * value) if value > 0 else np.zeros_like(influence)
-
-
-def _stratified_error(influence: Array, case: NDArray[np.int64]) -> float:
-    variance = 0.0
-    for stratum in np.unique(case):
-        part = influence[case == stratum]
-        variance += part.size * float(part.var(ddof=1)) if part.size > 1 else math.nan
-    return math.sqrt(variance) / influence.size
+    return value, slope / (2 * value) if value > 0 else np.zeros(2)

@@ -1,13 +1,14 @@
 """A run folder's results as text and as JSON; tables in, lines out."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from rich import box
-from rich.console import Console
+from rich.console import Console, RenderableType
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -20,7 +21,10 @@ COLUMNS = (
     ("mode_accuracy", "mode\naccuracy"),
     ("mode_brier", "Brier\nscore"),
 )
-MOST_DECIMALS = 4  # four columns of them fit into 80 characters
+MOST_DECIMALS = 6  # more than that, and figures of a million on, take an exponent
+MOST_DIGITS = 6  # of a figure with an exponent, after its point
+SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
+WIDEST = 10_000
 VERDICT_STYLES = {
     "reproduced": "green",
     "reproduced with stated assumptions": "green",
@@ -35,34 +39,69 @@ def figure(value: float, error: float) -> str:
         return ""
     if math.isnan(error):
         return f"{value:.4g}"
-    if error == 0.0:
-        return f"{value:.4g}±0"
-    decimals = min(max(-math.floor(math.log10(error)), 0), MOST_DECIMALS)
-    return f"{value:.{decimals}f}±{error:.{decimals}f}"
+    if error == 0.0 or math.isinf(value) or math.isinf(error):
+        return f"{value:.4g}±{error:.4g}"
+    last = math.floor(math.log10(error))  # place of the error's first digit
+    if max(abs(value), error) < 1e6 and -last <= MOST_DECIMALS:
+        decimals = max(-last, 0)
+        return f"{value:.{decimals}f}±{error:.{decimals}f}"
+    first = math.floor(math.log10(abs(value))) if value else last
+    return f"{value:.{min(max(first - last, 0), MOST_DIGITS)}e}±{error:.0e}"
+
+
+def counted(number: int, thing: str) -> str:
+    """'1 run', '2,000 runs'."""
+    return f"{number:,} {thing}{'s' * (number != 1)}"
 
 
 def show(path: Path, console: Console) -> None:
-    """Print a finished run: its table, comparisons, the published figures with their verdicts."""
+    """Print a finished run: its table, comparisons, the published figures with their verdicts.
+
+    No digit and no letter is left out: a table too wide for a terminal folds its names, then goes
+    beyond the edge; on anything else than a terminal it is as wide as it needs to be.
+    """
+    with console.capture() as captured:
+        for part in _parts(path):
+            if isinstance(part, Table) and not part.expand:
+                part.width = _width(part, console)
+            console.print(part, crop=False)
+    lines = [line.rstrip() for line in captured.get().splitlines()]
+    console.file.write("\n".join([*lines, ""]))
+
+
+def _parts(path: Path) -> Iterator[RenderableType]:
+    """What is printed, one below the other. A user's words are Text: nothing in them is markup."""
     manifest = results.require_complete(path)
     summary = results.read_table(path, "summary")
     runs, cases = manifest["runs"], manifest["cases"]
     over = f" in each of {cases} cases" if cases > 1 else ""
-    console.print(f"{manifest['title']}: {runs:,} runs{over}, seed {manifest['seed']}")
-    console.print()
-    console.print(_summary(summary, manifest["estimators"]))
+    yield Text(f"{manifest['title']}: {counted(runs, 'run')}{over}, seed {manifest['seed']}\n")
+    yield _summary(summary, manifest["estimators"])
     comparisons = results.read_table(path, "comparisons")
     if len(comparisons):
-        console.print()
-        console.print(_ratios(comparisons, manifest["compare_with"]))
+        yield ""
+        yield _ratios(comparisons, manifest["compare_with"])
     for label, count in manifest.get("diverged", {}).items():
-        console.print(f"{label}: {count:,} of {runs * cases:,} runs diverged and are left out")
-    windows = [window for window in manifest["windows"] if window != "all"]
+        yield Text(
+            f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
+        )
+    windows = [w for w in manifest["windows"] if w != "all" and w in set(summary["window"])]
     if windows:
-        console.print(f"windows {', '.join(windows)}: see summary.csv", highlight=False)
+        yield Text(f"windows {', '.join(windows)}: see summary.csv")
     published = results.read_table(path, "published")
     if len(published):
-        console.print()
-        console.print(_published(published))
+        yield ""
+        yield _published(published)
+
+
+def _width(table: Table, console: Console) -> int:
+    """All that a table needs; on a terminal less where that is at the expense of names alone."""
+    options = console.options.update(width=WIDEST)
+    needed = Measurement.get(console, options, table).maximum
+    if not console.is_terminal:
+        return needed
+    names = max(len(str(cell)) for cell in (table.columns[0].header, *table.columns[0].cells))
+    return max(min(needed, console.width), needed - max(names - SHORTEST_NAME, 0))
 
 
 def _plain_table() -> Table:
@@ -91,19 +130,20 @@ def _by_metric(heading: str, labels: list[str], figures: dict[tuple[str, str], s
     """A row per estimator, a column per metric that there is."""
     metrics = [(m, h) for m, h in COLUMNS if any(key[1] == m for key in figures)]
     table = _plain_table()
-    table.add_column(heading, no_wrap=True)
+    table.add_column(Text(heading), overflow="fold")
     for _, text in metrics:
         text = text.partition(",")[0] if heading.startswith("ratio") else text
         table.add_column(text, justify="right", no_wrap=True)
     for label in labels:
-        table.add_row(label, *(figures.get((label, metric), "") for metric, _ in metrics))
+        table.add_row(Text(label), *(figures.get((label, metric), "") for metric, _ in metrics))
     return table
 
 
 def _published(published: pd.DataFrame) -> Table:
     table = _plain_table()
-    table.add_column("verdict", width=18)
-    table.add_column("published claim", ratio=1)
+    table.expand = True
+    table.add_column("verdict", width=18, overflow="fold")
+    table.add_column("published claim", ratio=1, overflow="fold")
     for row in published.to_dict("records"):
         verdict = Text(row["verdict"], style=VERDICT_STYLES.get(row["verdict"], ""))
         if row["differs"]:
@@ -129,8 +169,10 @@ def obtained(row: Mapping[Any, Any]) -> str:
 
 
 def surprises(path: Path) -> list[str]:
-    """A sentence for every verdict that isn't the expected one."""
-    return [
+    """A sentence for every window without a step and every verdict that isn't the expected one."""
+    there = set(results.read_table(path, "summary")["window"])
+    empty = [w for w in results.require_complete(path)["windows"] if w not in there]
+    return [f"window '{w}' holds no measured step, so it has no figures" for w in empty] + [
         f"'{row['claim']}' came out as: {row['verdict']}; expected: {row['expected_verdict']}"
         for row in results.read_table(path, "published").to_dict("records")
         if row["differs"]
@@ -138,10 +180,10 @@ def surprises(path: Path) -> list[str]:
 
 
 def as_json(path: Path) -> dict[str, Any]:
-    """The same for programs; NaN is null."""
+    """The same for programs; NaN and infinity are null."""
     manifest = results.require_complete(path)
     tables = {
-        name: [_without_nan(row) for row in results.read_table(path, name).to_dict("records")]
+        name: [_finite(row) for row in results.read_table(path, name).to_dict("records")]
         for name in ("summary", "comparisons", "published")
     }
     return {
@@ -155,8 +197,8 @@ def as_json(path: Path) -> dict[str, Any]:
     }
 
 
-def _without_nan(row: Mapping[Any, Any]) -> dict[str, Any]:
+def _finite(row: Mapping[Any, Any]) -> dict[str, Any]:
     return {
-        str(key): None if isinstance(value, float) and math.isnan(value) else value
+        str(key): None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in row.items()
     }

@@ -5,7 +5,8 @@ a metric of a run. A figure is met if ours, give or take K standard errors, lies
 printed digits can mean; a comparison holds if the paired difference has the claimed sign by more
 than K standard errors. Agreement within an error wider than the printed digits decides nothing.
 The error is itself estimated from the runs: where these are few, Student's quantile of the same
-probability stands for K, and one run decides nothing.
+probability stands for K, and one run decides nothing. A window that holds no step, or no run that
+didn't diverge, leaves nothing to judge.
 """
 
 import math
@@ -24,6 +25,7 @@ ASSUMED = "reproduced with stated assumptions"
 DIRECTION = "direction only"
 NOT_REPRODUCED = "not reproduced"
 UNDECIDED = "undecided: too few runs"
+NO_DATA = "undecided: no data"
 
 Verdict = Literal[
     "reproduced", "reproduced with stated assumptions", "direction only", "not reproduced"
@@ -81,7 +83,7 @@ def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
     elif gap < -allowed:
         verdict = NOT_REPRODUCED
     else:
-        verdict = UNDECIDED
+        verdict = _undecided(ours.difference)
     return _outcome(claim, figure, verdict)
 
 
@@ -92,7 +94,11 @@ def _figure(claim: Claim, ours: Estimate, assumptions: bool) -> str:
         return NOT_REPRODUCED
     if allowed <= claim.tolerance:
         return ASSUMED if assumptions else REPRODUCED
-    return UNDECIDED
+    return _undecided(ours)
+
+
+def _undecided(ours: Estimate) -> str:
+    return UNDECIDED if ours.n_runs else NO_DATA
 
 
 def _allowed(ours: Estimate) -> float:
@@ -103,4 +109,4 @@ def _allowed(ours: Estimate) -> float:
 
 
 def _outcome(claim: Claim, ours: Estimate, verdict: str) -> Outcome:
-    return Outcome(claim, ours, verdict, verdict not in (claim.expect, UNDECIDED))
+    return Outcome(claim, ours, verdict, verdict not in (claim.expect, UNDECIDED, NO_DATA))

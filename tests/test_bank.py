@@ -113,6 +113,24 @@ def test_known_modes_equal_the_reference_and_the_kalman_filter():
     np.testing.assert_allclose(estimates.mean, alone.mean, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["imm", "mmae with a floor", "rmimm"])
+def test_supermodes_of_one_name_are_reported_as_one(name):
+    rng = np.random.default_rng(21)
+    model = random_model(rng)
+    z = measurements(rng, 15, 2, 3)
+    recursion, _ = FILTERS[name]
+    apart, _ = run_kernel(model, z, recursion)
+    named, state = run_kernel(model._replace(mode_names=("a", "b", "a")), z, recursion)
+    a, b, other_a = np.moveaxis(apart.mode_probabilities, 1, 0)
+    assert min(a.max(), other_a.max()) > 0.1  # neither is the sum alone
+    expected = np.stack([a + other_a, b], axis=1)
+    # Rounding of one sum.
+    np.testing.assert_allclose(named.mode_probabilities, expected, rtol=0, atol=1e-15)
+    assert named.mean.tobytes() == apart.mean.tobytes()
+    assert state.mode_probabilities.shape == (3, 3)  # inside they stay apart
+    assert named.mode_likelihoods.size == 0  # a likelihood of several modes together is none
+
+
 @pytest.mark.parametrize("n_times", [1, 20])
 def test_two_spans_give_the_bytes_of_one(n_times):
     rng = np.random.default_rng(14)
@@ -340,6 +358,28 @@ def test_covariance_update_keeps_josephs_digits():
     # Joseph's form keeps the order of the measured variance, 1e-9 of 1e9, and so must this.
     assert np.linalg.eigvalsh(got)[0] > -1e-6
     assert abs(got[1, 1] / exact[1, 1] - 1) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rounding_turns_no_variance_negative(seed):
+    """P0/R = 1e18 without process noise: after two scans small variances are all rounding.
+
+    Textbook Joseph has S <= 0 in a quarter of such cases, the plain form in nearly all.
+    """
+    rng = np.random.default_rng(seed)
+    T = rng.uniform(0.3, 3.0)
+    model = random_model(rng, n_modes=1, n_x=2, n_y=1)._replace(
+        state_transition=np.array([[1.0, T], [0.0, 1.0]]).reshape(1, 1, 2, 2),
+        input_effect=np.zeros((1, 1, 2)),
+        process_noise_covariance=np.zeros((1, 1, 2, 2)),
+        measurement_matrix=np.array([[[1.0, 0.0]]]),
+        measurement_noise_covariance=np.full((1, 1, 1), 1e-9),
+        initial_covariance=1e9 * np.eye(2),
+    )
+    estimates, _ = run_kernel(model, np.zeros((30, 1, 1)))
+    covariance = unpacked(np.moveaxis(estimates.covariance, 0, 1), 2)
+    assert np.isfinite(estimates.mean).all()
+    assert (covariance[[0, 1], [0, 1]] >= 0).all()
 
 
 def test_long_run_stays_symmetric_and_positive_definite():

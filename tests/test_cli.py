@@ -177,7 +177,10 @@ def test_out_names_the_folder_and_other_runs_are_safe_in_it(tmp_path):
     [
         (["run", "nothing.yaml"], ["nothing.yaml", "no such file"]),
         (["run", "rmimm_fig6"], ["rmimm_fig6", "rmimm_fig5"]),
-        (["run", "rmimm_fig5", "--runs", "0"], ["monte_carlo.runs=0"]),
+        (["run", "rmimm_fig5", "--runs", "0"], ["error: --runs 0: ", "at least 1"]),
+        (["run", "rmimm_fig5", "--seed", "-1"], ["error: --seed -1: "]),
+        (["run", "rmimm_fig5", "--set", "monte_carlo.runs=0"], ["--set monte_carlo.runs=0"]),
+        (["validate", "x" * 300], ["cannot be read"]),
         (["run", "rmimm_fig5", "--set", "monte_carlo.sede=1"], ["sede", "did you mean 'seed'?"]),
         (["run", "rmimm_fig5", "--set", "foo"], ["foo"]),
         (["plot", "."], ["run folder"]),
@@ -242,6 +245,109 @@ def test_list_and_schema(tmp_path):
     assert "rmimm" not in only
     schema = json.loads(hybridtrack("schema", cwd=tmp_path).stdout)
     assert "monte_carlo" in schema["properties"]
+
+
+def test_a_folder_of_a_shipped_name_is_no_scenario(tmp_path):
+    (tmp_path / "rmimm_fig5").mkdir()
+    done = hybridtrack("validate", "rmimm_fig5", cwd=tmp_path)
+    assert done.stdout.startswith("rmimm_fig5: ok (1 case, ")
+    assert "folder" in one_sentence(hybridtrack("validate", ".", cwd=tmp_path))
+
+
+def test_no_summary_is_cut_in_the_list_of_commands(tmp_path):
+    text = hybridtrack("--help", cwd=tmp_path, COLUMNS="80").stdout
+    assert "..." not in text.partition("Commands:")[2]
+
+
+def test_figures_that_are_missing_are_drawn_again(finished):
+    cwd, first = finished
+    figures = cwd / first.stdout.splitlines()[-1] / "figures"
+    before = {p.name: p.read_bytes() for p in figures.iterdir()}
+    (figures / "trajectory.png").unlink()
+    again = hybridtrack(*SMALL, cwd=cwd)
+    assert "drawing figures" in again.stderr
+    assert before == {p.name: p.read_bytes() for p in figures.iterdir()}
+    assert "drawing figures" not in hybridtrack(*SMALL, cwd=cwd).stderr
+
+
+def test_a_bigger_run_is_shown_as_what_it_is(finished):
+    cwd, first = finished
+    fewer = hybridtrack("run", "rmimm_fig5", "--runs", "1", cwd=cwd)
+    assert fewer.stdout == first.stdout
+    assert "holds 40 runs, you asked for 1" in fewer.stderr
+    assert "asked" not in hybridtrack(*SMALL, cwd=cwd).stderr
+
+
+def through_shell(line, cwd, **environment):
+    """A command line with `{}` for hybridtrack, run by a shell."""
+    command = line.replace("{}", f"'{sys.executable}' -m hybridtrack")
+    return subprocess.run(
+        ["bash", "-o", "pipefail", "-c", command],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_an_output_that_takes_nothing(tmp_path):
+    for command in ("list", "--help", "schema"):
+        full = through_shell(f"{{}} {command} >/dev/full", tmp_path)
+        assert full.returncode == 2, full.stderr
+        assert full.stderr.startswith("error: the output: cannot be ")
+        assert full.stderr.count("\n") == 1
+    gone = through_shell("{} schema | sleep 0", tmp_path)  # it ends before there is a schema
+    assert (gone.returncode, gone.stderr) == (141, "")
+
+
+def test_streams_that_are_closed(finished):
+    cwd, first = finished
+    command = "{} " + " ".join(SMALL)
+    silent = through_shell(command + " 2>&-", cwd)
+    assert (silent.returncode, silent.stdout) == (0, first.stdout)
+    deaf = through_shell(command + " 2>/dev/full", cwd)
+    assert (deaf.returncode, deaf.stdout) == (0, first.stdout)
+    unheard = through_shell(command + " -q >&-", cwd)
+    assert (unheard.returncode, unheard.stderr) == (0, "")
+
+
+def test_an_output_without_our_characters(finished):
+    cwd, first = finished
+    done = hybridtrack(*SMALL, cwd=cwd, PYTHONIOENCODING="ascii")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.isascii()
+    assert done.stdout.count("?") >= first.stdout.count("±")
+
+
+@pytest.mark.parametrize(
+    "place", ["config.load", "experiment.is_complete", "tables.show", "compiled.source_digest"]
+)
+def test_interrupts_anywhere_are_one_line_and_130(finished, place):
+    """A SIGINT from within a function that is called on the way; two more while it ends."""
+    cwd, _ = finished
+    module, _, name = place.partition(".")
+    code = (
+        "import os, signal, sys, atexit\n"
+        f"sys.argv = ['hybridtrack', *{SMALL!r}, '-q']\n"
+        "from hybridtrack import cli\n"
+        f"from hybridtrack import {module} as module\n"
+        "again = lambda: os.kill(os.getpid(), signal.SIGINT)\n"
+        "atexit.register(again)\n"
+        f"module.{name} = lambda *_: again()\n"
+        "cli.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_an_interrupt_tells_what_is_kept(tmp_path):
+    from hybridtrack.cli import _what_is_kept
+
+    assert "no shard was finished" in _what_is_kept(tmp_path)
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards/0.npz").write_text("")
+    assert "finished shards are kept in" in _what_is_kept(tmp_path)
 
 
 def start_long_run(cwd, runs="2000000"):

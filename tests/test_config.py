@@ -151,6 +151,8 @@ LIMITS: list[tuple[Edit, str]] = [
     ((NOISE, "position_std_m: »1e999}"), "1e999 is not a finite number; give one that is"),
     ((NOISE, "»position_std_m: 1e300}"), "is 1e300; a number here is 0 or of a size between 1e-30"),
     ((NOISE, "»position_std_m: 1e-200}"), "is 1e-200; a number here is 0 or of a size between"),
+    ((NOISE, "»position_std_km: 1e28}"), "is 1e28; a number here is 0 or of a size between 1e-30 "),
+    (("turn_rate_deg_s: 1.5", "»turn_rate_deg_s: 2e-30"), "between 1e-30 and 1e+30 in SI units"),
     ((NOISE, "position_std_m: 1, »detection_probability: 1.5}"), "is 1.5; it must be at most 1"),
     ((NOISE, "position_std_m: 1, »detection_probability: 0}"), "is 0; it must be greater than 0"),
     (("step_s: 1,", "»step_s: 0,"), "'step_s' is 0; it must be greater than 0"),
@@ -179,7 +181,10 @@ NAMES: list[tuple[Edit, str]] = [
     ((MMAE, "»é: {type: mmae}"), f"'é' is no name; {LETTERS}"),
     ((MMAE, "»'': {type: mmae}"), "a key is empty; give it a name"),
     ((MMAE, f"»{LONG}: {{type: mmae}}"), "is no name; use at most 64 characters"),
-    ((MMAE, "»raw: {type: mmae}"), "'raw' names a row of every table; call it otherwise"),
+    ((MMAE, "»raw: {type: mmae}"), "'raw' means something else in tables and figures; call it"),
+    ((MMAE, "»measurement: {type: mmae}"), "'measurement' means something else in tables and fig"),
+    ((MMAE, "»measurements: {type: mmae}"), "'measurements' means something else in tables and f"),
+    ((MMAE, "»_MMAE: {type: mmae}"), "'_MMAE' begins with _; begin with a letter or a digit"),
     ((CT, CT.replace("CT", "»'C T'")), f"'C T' is no name; {LETTERS}"),
     ((WINDOW, WINDOW.replace("straight", "»straight ", 1).replace("d _", "d_")), LETTERS),
     ((WINDOW, "»all: {mode: CV}"), "'all' is every scored step already; call it otherwise"),
@@ -612,6 +617,40 @@ def test_a_mistake_in_a_setting_names_the_setting(setting: str, sentence: str) -
     assert refused(FIG5, setting).startswith(f"--set {setting}: {sentence}")
 
 
+RECORDED = """
+name: recorded
+truth: {recording: {file: scans.csv, as: measurements}}
+sensor: {position_std_m: 20}
+modes: {CV: {motion: constant_velocity, acceleration_psd_m2_s3: 1}}
+initial: {from_measurements: two_point}
+estimators: {KF: {type: kalman, mode: CV}}
+monte_carlo: {runs: 1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("file=no.csv", "there is no recording"),
+        ("package=no-such-package==1.0", "the recording lies in the package no-such-package"),
+        ("columns.time=hour", "'scans.csv' has no time column 'hour'"),
+        ("thin_to_min=60", "track 'scans' leaves 1 scans"),
+        ("reference.file=no.csv", "there is no recording"),
+        ("reference={file: ref.csv, columns: {x: e}}", "'ref.csv' has no x column 'e'"),
+    ],
+)
+def test_a_setting_that_spoils_a_recording_is_named(
+    setting: str, sentence: str, tmp_path: Path
+) -> None:
+    lines = [f"{t},{200 * t},{t % 3}" for t in range(30)]
+    for name in ("scans.csv", "ref.csv"):
+        (tmp_path / name).write_text("\n".join(["time,x,y", *lines]))
+    (tmp_path / "a.yaml").write_text(RECORDED)
+    load(tmp_path / "a.yaml")
+    message = refused(tmp_path / "a.yaml", f"truth.recording.{setting}")
+    assert message.startswith(f"--set truth.recording.{setting}: {sentence}")
+
+
 # --- any mutation --------------------------------------------------------------------------------
 
 
@@ -968,3 +1007,11 @@ def test_the_json_schema_knows_no_other_key(path: str) -> None:
     schema = json_schema()
     data = read(FIG5).with_setting(f"{path}=1").data
     assert not described(schema, schema, data)
+
+
+def test_the_json_schema_knows_the_names_and_the_metrics() -> None:
+    schema = json.loads(json.dumps(json_schema()))
+    assert "patternProperties" not in json.dumps(schema)  # would let every other name pass
+    names = schema["properties"]["estimators"]["propertyNames"]
+    assert names == {"pattern": "^[A-Za-z0-9_-]+$", "maxLength": 64}
+    assert "position_rmse_m" in schema["$defs"]["ClaimForm"]["properties"]["metric"]["enum"]

@@ -18,8 +18,14 @@ from hybridtrack.blocks import BlockTask, run_block, summarise
 from hybridtrack.config import load
 from hybridtrack.experiment import digest, is_complete, plan, run
 from hybridtrack.outcomes import paired
-from hybridtrack.results import RunFolder, read_manifest, read_run_sums, read_table
-from hybridtrack.statistics import METRICS, RunSums, compare, ratio_of_sums
+from hybridtrack.results import (
+    RunFolder,
+    read_manifest,
+    read_table,
+    require_complete,
+    run_sums,
+)
+from hybridtrack.statistics import METRICS, RunSums, compare, pair_moments, ratio_of_sums
 from models import RANDOM, SMALL, scenario
 
 TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published")
@@ -196,6 +202,47 @@ def test_continued_runs_equal_a_fresh_run(tiny, tmp_path, monkeypatch):
     assert contents(tmp_path / "grown") == contents(tmp_path / "fresh")
 
 
+def interrupt_last(done, total):
+    """Ctrl-C when the first shard of 2,304 runs is on disk."""
+    if done > 2048:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_extension_leaves_the_result_and_its_own_shards(tiny, tmp_path, monkeypatch):
+    experiment, folder = tiny
+    short = with_runs(experiment, 300)
+    run(short, tmp_path, 1, quiet)
+    before = {name: data for name, data in contents(tmp_path).items() if "shards" not in name}
+    with pytest.raises(KeyboardInterrupt):
+        run(experiment, tmp_path, 1, interrupt_last)
+    after = contents(tmp_path)
+    assert {name: after[name] for name in after if "shards" not in name} == before
+    assert require_complete(tmp_path)["runs"] == 300
+    assert read_manifest(tmp_path)["under_way"]["runs"] == 2304
+    assert is_complete(tmp_path, short)
+    assert not is_complete(tmp_path, experiment)
+    counted = Counted(monkeypatch)
+    run(with_runs(experiment, 200), tmp_path, 1, quiet)  # there are more: nothing to do
+    assert counted.blocks == []
+    assert contents(tmp_path) == after
+    run(experiment, tmp_path, 1, quiet)
+    assert counted.blocks == [(0, 8)]
+    assert contents(tmp_path) == contents(folder)
+    assert "under_way" not in read_manifest(tmp_path)
+
+
+def test_a_shorter_run_keeps_the_shards_of_an_interrupted_longer_one(tiny, tmp_path, monkeypatch):
+    experiment, folder = tiny
+    with pytest.raises(KeyboardInterrupt):
+        run(experiment, tmp_path, 1, interrupt_last)
+    run(with_runs(experiment, 300), tmp_path, 1, quiet)
+    assert require_complete(tmp_path)["runs"] == 300
+    counted = Counted(monkeypatch)
+    run(experiment, tmp_path, 1, quiet)
+    assert counted.blocks == [(0, 8)]
+    assert contents(tmp_path) == contents(folder)
+
+
 def test_first_runs_are_the_same_in_a_longer_study(tiny, tmp_path):
     experiment, folder = tiny
     run(with_runs(experiment, 300), tmp_path, 1, quiet)
@@ -217,7 +264,7 @@ def test_a_complete_folder_serves_fewer_runs_and_not_more(tiny):
     )
 
 
-def two_tracks(folder, **recording):
+def two_tracks(folder, runs=20, **recording):
     """Two uneven recorded tracks (CSV) as an experiment's cases."""
     rng = np.random.default_rng(4)
     rows = []
@@ -239,25 +286,30 @@ initial: {{from_measurements: two_point}}
 estimators: {{IMM: {{type: imm}}, KF: {{type: kalman, mode: agile}}}}
 compare_with: IMM
 scoring: {{skip_scans: 4}}
-monte_carlo: {{runs: 20, seed: 2}}
+monte_carlo: {{runs: {runs}, seed: 2}}
 """
     return scenario(folder, text)
 
 
 def test_a_study_of_two_cases_killed_between_two_files_can_grow(tmp_path, monkeypatch):
-    """runs.parquet is there already and nothing else says that it is longer than before."""
+    """The tables are there already, and the manifest doesn't say so."""
     experiment = two_tracks(tmp_path)
     monkeypatch.setattr(room, "SHARD_BLOCKS", 1)
     short, long = with_runs(experiment, 256), with_runs(experiment, 300)
     run(short, tmp_path / "grown", 1, quiet)
 
-    def die(self, names):
-        raise KeyboardInterrupt
+    written = RunFolder.write_manifest
+
+    def die(self, manifest):
+        if manifest["status"] == "complete" and manifest["runs"] == 300:
+            raise KeyboardInterrupt
+        written(self, manifest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(RunFolder, "drop_parts", die)
+        patch.setattr(RunFolder, "write_manifest", die)
         with pytest.raises(KeyboardInterrupt):
             run(long, tmp_path / "grown", 1, quiet)
+    assert read_manifest(tmp_path / "grown")["status"] == "running"  # tables old and new
     counted = Counted(monkeypatch)
     run(long, tmp_path / "grown", 1, quiet)
     assert counted.blocks == []
@@ -320,7 +372,9 @@ def test_steps_equal_recomputation_from_tracks(tmp_path, text):
     modes, axes = experiment.bank.names, "xy"[: experiment.bank.dimensions]
     for label in ("raw", "IMM", "KF"):
         source = wide["measurement" if label == "raw" else label]
-        squared = sum((source[a] - wide["truth"][a]) ** 2 for a in axes).where(source["x"].notna())
+        squared = sum((source[a] - wide["truth"][a]) ** 2 for a in axes)
+        scored = source["x"].notna() & wide["IMM"]["x"].notna()  # not what a two-point start uses
+        squared = squared.where(scored)
         series = {"position_rmse_m": squared, "position_mse_m2": squared}
         if label != "raw":
             speed = sum((source[f"v{a}"] - wide["truth"][f"v{a}"]) ** 2 for a in axes)
@@ -370,7 +424,7 @@ def test_standard_errors_are_the_spread_over_seeds(tmp_path):
                     ratio_of_sums([cell], METRICS[metric].root)[:2]
                 )
         both = [sums_of(result, label, "all", "position_rmse_m") for label in ("IMM", "KF")]
-        pair = compare(*both, True)
+        pair = compare(pair_moments(*both), True)
         found.setdefault("difference", []).append(pair.difference[:2])
         found.setdefault("ratio", []).append(pair.ratio[:2])
     for name, pairs in found.items():
@@ -431,8 +485,8 @@ def test_a_run_that_diverged_leaves_its_pair_and_is_counted(tmp_path, monkeypatc
     assert n_runs == {"raw": 30, "KF": 30, "MMAE": 30, "IMM": 28, "RMIMM": 30}
     assert summary["value"].max() < 100
     assert set(read_table(folder, "comparisons")["n_pairs"]) == {28}
-    status = read_run_sums(folder, "IMM", "all")[2]
-    assert np.flatnonzero(status).tolist() == [3, 7]
+    (columns,) = run_sums(folder, "IMM", "all")
+    assert np.flatnonzero(columns["status"]).tolist() == [3, 7]
 
 
 def test_one_run_has_no_standard_error(tmp_path):
@@ -479,7 +533,7 @@ def test_two_recorded_tracks_are_two_cases(tmp_path):
 
 
 def test_measurements_without_a_truth_give_no_errors(tmp_path):
-    experiment = two_tracks(tmp_path, **{"as": "measurements"})
+    experiment = two_tracks(tmp_path, runs=1, **{"as": "measurements"})
     run(experiment, tmp_path / "a", 1, quiet)
     summary, steps, tracks = (read_table(tmp_path / "a", t) for t in ("summary", "steps", "tracks"))
     assert set(summary["metric"]) == {"likelihood_distinctness"}

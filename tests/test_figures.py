@@ -251,7 +251,18 @@ def test_trajectory_is_true_to_shape_in_km(flight):
     (x0, y0), (x1, y1) = ax.transData.transform([(0, 0), (1000, 1000)])
     assert x1 - x0 == pytest.approx(y1 - y0, rel=1e-9)  # rounding
     assert ax.xaxis.get_major_formatter()(15_000) == "15"
-    assert line(ax, "measurements").get_linestyle() == "None"
+    dots, truth = line(ax, "measurements"), line(ax, "truth")
+    assert dots.get_linestyle() == "None"
+    assert dots.get_markersize() > truth.get_linewidth()
+    assert all(dots.zorder > one.zorder for one in ax.lines if one.get_linestyle() != "None")
+
+
+def test_the_first_scan_is_not_called_the_start(flight):
+    ax = flight["trajectory"].axes[0]  # the start, k = 0, isn't in the tables
+    (x,), (y,) = line(ax, "first scan").get_data()
+    truth = line(ax, "truth")
+    assert (x, y) == (truth.get_xdata()[0], truth.get_ydata()[0])
+    assert "start" not in [one.get_label() for one in ax.lines]
 
 
 def test_a_target_at_rest_frames_its_estimates():
@@ -293,7 +304,10 @@ def test_a_recorded_track_is_broken_at_gaps_and_nan(tmp_path):
     assert unknown.sum() == 9  # points whose six steps are all among the sixty unknown ones
     assert ((x[unknown] >= time[700]) & (x[unknown] < time[760])).all()
     assert "6 steps a point" in figures["position_error"].get_suptitle()
-    assert np.isnan(line(figures["trajectory"].axes[0], "IMM").get_xdata()[1200])
+    estimate = line(figures["trajectory"].axes[0], "IMM")
+    assert np.isnan(estimate.get_xdata()[1200])
+    # 3,000 measurements in a row would hide it
+    assert line(figures["trajectory"].axes[0], "measurements").zorder < estimate.zorder
     save(figures, tmp_path)  # a warning of matplotlib's on NaN would be an error here
     for figure in figures.values():
         assert_nothing_hidden(figure)
@@ -306,6 +320,11 @@ def test_a_point_between_gaps_is_a_dot():
     ax = draw(steps, tracks, information)["position_error"].axes[0]
     dots = [one for one in ax.lines if one.get_marker() == "."]
     assert [one.get_xdata().tolist() for one in dots] == [[10.0]]
+    (bars,) = [c for c in ax.collections if isinstance(c, LineCollection) and not c.get_gid()]
+    (row,) = steps[mine & (steps["step"] == 10)].itertuples()
+    two_errors = 2 * row.standard_error
+    expected = [[10.0, row.value - two_errors], [10.0, row.value + two_errors]]
+    np.testing.assert_array_equal(bars.get_segments(), [expected])  # a band would be invisible
 
 
 def test_one_step_and_one_run(tmp_path):

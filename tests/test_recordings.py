@@ -19,7 +19,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridtrack.errors import UserError
-from hybridtrack.recordings import Source, Track, read_tracks, smooth, thin
+from hybridtrack.recordings import (
+    Source,
+    Track,
+    about,
+    read_tracks,
+    seconds_after,
+    smooth,
+    thin,
+)
 
 FLIGHT = Source(
     file="data/samples/featured/belevingsvlucht.json.gz",
@@ -242,6 +250,47 @@ def test_local_plane_is_the_tangent_plane_at_the_first_kept_position(tmp_path: P
     # Rounding of geocentric coordinates of 6e6 m, a few times 1e-9 m.
     np.testing.assert_allclose(track.position_m, expected, rtol=0.0, atol=1e-7)
     assert tuple(track.position_m[0]) == (0.0, 0.0)
+
+
+def test_a_track_moves_to_the_plane_of_another(tmp_path: Path) -> None:
+    latitude, longitude = np.linspace(52.0, 52.5, 12), np.linspace(5.0, 6.0, 12)
+    frame = table(x=None, y=None, lat=latitude, lon=longitude)
+    track = only(saved(tmp_path, frame, "a.parquet"))
+    other = only(saved(tmp_path, frame.assign(lat=latitude + 1.0), "b.parquet"))
+    moved = about(track, other)
+    expected = [
+        east_north(*degrees, (53.0, 5.0)) for degrees in zip(latitude, longitude, strict=True)
+    ]
+    np.testing.assert_allclose(moved.position_m, expected, rtol=0.0, atol=1e-7)  # as above
+    np.testing.assert_allclose(about(moved, track).position_m, track.position_m, atol=1e-7)
+    planar = only(saved(tmp_path, table(), "c.parquet"))
+    assert about(planar, planar) is planar
+    for one, two in ((track, planar), (planar, track)):
+        with pytest.raises(UserError, match="one has latitude and longitude and the other x and y"):
+            about(one, two)
+
+
+def test_how_much_later_a_track_begins(tmp_path: Path) -> None:
+    early, late = (
+        only(saved(tmp_path, table(time=start + np.arange(12.0)), f"{start}.csv"))
+        for start in (-5, 7)
+    )
+    assert (early.start_s, late.start_s, late.time_s[0]) == (-5.0, 7.0, 0.0)
+    assert seconds_after(late, early) == 12.0
+    assert seconds_after(early, late) == -12.0
+    dated = only(saved(tmp_path, table(time=TIMES), "a.parquet"))
+    later = only(saved(tmp_path, table(time=TIMES + pd.Timedelta("90s")), "b.parquet"))
+    assert dated.start_s == 0.0
+    assert seconds_after(later, dated) == 90.0
+    assert seconds_after(dated, later) == -90.0
+    with pytest.raises(UserError, match="one has dates and the other plain seconds"):
+        seconds_after(dated, late)
+
+
+def test_plain_seconds_begin_at_the_first_sample_that_is_used(tmp_path: Path) -> None:
+    frame = table(time=np.arange(3.0, 15.0), altitude=[100.0, 100.0, *[9000.0] * 10])
+    track = only(saved(tmp_path, frame, minimum_altitude_m=457.2))
+    assert (track.start_s, track.time_s[0], track.time_s[-1]) == (5.0, 0.0, 9.0)
 
 
 def test_metres_stand_as_they_are_and_named_columns_come_first(tmp_path: Path) -> None:

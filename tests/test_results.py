@@ -11,17 +11,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from hybridtrack.errors import UserError
-from hybridtrack.experiment import run
+from hybridtrack.experiment import is_complete, run
 from hybridtrack.outcomes import paired
 from hybridtrack.results import (
     SCHEMAS,
     RunFolder,
     clear,
     read_manifest,
-    read_run_sums,
     read_table,
     replacing,
     require_complete,
+    run_sums,
     write_text,
 )
 from models import SMALL, scenario
@@ -136,6 +136,31 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        '{"name": "My PWA", "display": "standalone"}',
+        '{"status": "complete"}',
+        '{"status": "ok", "digest": "d1"}',
+        '{"status": "running", "digest": 1}',
+        "[]",
+    ],
+)
+def test_a_folder_with_somebody_elses_manifest_is_left_alone(tmp_path, finished, manifest):
+    (tmp_path / "manifest.json").write_text(manifest)
+    (tmp_path / "summary.csv").write_text("theirs")
+    for use in (
+        lambda: RunFolder(tmp_path, "d1"),
+        lambda: clear(tmp_path, "d1"),
+        lambda: require_complete(tmp_path),
+    ):
+        with pytest.raises(UserError, match=r"something else|no run folder") as caught:
+            use()
+        assert "--force" not in sentence(caught)
+    assert not is_complete(tmp_path, finished[0])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["manifest.json", "summary.csv"]
+
+
 def test_a_folder_with_another_run_is_left_alone(finished):
     experiment, folder = finished
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
@@ -150,9 +175,20 @@ def test_a_folder_with_another_run_is_left_alone(finished):
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "run"):
+        assert read_manifest(path) is None
+        clear(path, "d1")  # --force doesn't touch it
         with pytest.raises(UserError, match="cannot be made") as caught:
             RunFolder(path, "d1")
         sentence(caught)
+    assert (tmp_path / "file").is_file()
+
+
+def test_a_folder_that_cannot_be_looked_at_is_one_sentence(tmp_path):
+    """A name that is too long fails as a folder without permission does, for any user."""
+    for use in (require_complete, lambda path: clear(path, "d1")):
+        with pytest.raises(UserError, match=r"manifest.json: cannot be read \(\D+\)") as caught:
+            use(tmp_path / ("x" * 300))
+        assert "remove" not in sentence(caught)
 
 
 def test_clear_removes_run_folders_finished_or_begun(damaged, tmp_path):
@@ -168,12 +204,22 @@ def test_clear_removes_run_folders_finished_or_begun(damaged, tmp_path):
 
 def test_clear_leaves_what_a_run_did_not_write(damaged):
     _, folder = damaged
-    (folder / "notes.txt").write_text("mine")
-    (folder / "figures").mkdir(exist_ok=True)
-    (folder / "figures" / "annotated.svg").write_text("mine too")
+    mine = {
+        "notes.txt",
+        "merged.parquet",
+        "film.mp4.part",
+        "figures/annotated.svg",
+        "figures/poster.png",
+        "shards/backup/0000-000000-5.npz",
+        "shards/mine.npz",
+        "unfinished/chapter.tex",
+    }
+    for name in (*mine, "figures/trajectory.png", "figures/position_error-east.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("mine")
     clear(folder, "d2")
     kept = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-    assert kept == {"notes.txt", "figures/annotated.svg", "manifest.json"}
+    assert kept == mine | {"manifest.json"}
     with RunFolder(folder, "d2"):  # and the folder may be written again
         pass
 
@@ -186,7 +232,7 @@ def cut(path, keep):
     path.write_bytes(data[: int(keep * len(data))])
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"status": ', "\xff\xfe"])
+@pytest.mark.parametrize("text", ["", "{", '{"status": ', "\xff\xfe", "[" * 100_000])
 def test_a_damaged_manifest_is_one_sentence(damaged, text):
     experiment, folder = damaged
     (folder / "manifest.json").write_text(text, encoding="latin-1")
@@ -195,9 +241,29 @@ def test_a_damaged_manifest_is_one_sentence(damaged, text):
         lambda: require_complete(folder),
         lambda: clear(folder, "d1"),
     ):
-        with pytest.raises(UserError, match=r"manifest.json: cannot be read .*; remove") as caught:
+        with pytest.raises(
+            UserError, match=r"manifest.json: this is no run's man.*; name"
+        ) as caught:
             use()
-        sentence(caught)
+        assert "remove" not in sentence(caught)  # it may be somebody else's
+    assert (folder / "runs.parquet").exists()
+
+
+@pytest.mark.parametrize("wrong", [{"title": None}, {"runs": "x"}, {"estimators": 3}])
+def test_a_manifest_with_other_content_is_one_sentence(damaged, wrong):
+    experiment, folder = damaged
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | wrong))
+    for use in (
+        lambda: is_complete(folder, experiment),
+        lambda: run(experiment, folder, 1, quiet),
+        lambda: require_complete(folder),
+    ):
+        with pytest.raises(UserError, match=r"manifest.json: .* damaged .*; repeat") as caught:
+            use()
+        assert next(iter(wrong)) in sentence(caught)
+    clear(folder, "d1")  # which is what --force does first
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
@@ -208,6 +274,35 @@ def test_a_damaged_shard_is_one_sentence(damaged, keep):
     with pytest.raises(UserError, match=r"npz: this file is damaged .*--force") as caught:
         run(experiment, folder, 1, quiet)
     sentence(caught)
+
+
+@pytest.mark.parametrize("keys", ['{"steps": []}', "3", "{", '{"steps": 1, "windows": 2}'])
+def test_a_shard_with_other_content_is_one_sentence(damaged, keys):
+    experiment, folder = damaged
+    (shard,) = (folder / "shards").glob("*.npz")
+    np.savez(shard, keys=np.array(keys), steps=np.zeros(3))
+    with pytest.raises(UserError, match=r"npz: this file is damaged .*--force") as caught:
+        run(experiment, folder, 1, quiet)
+    sentence(caught)
+
+
+@pytest.mark.parametrize("name", ["summary", "steps", "comparisons", "published", "tracks"])
+def test_another_table_in_its_place_is_one_sentence(damaged, name):
+    _, folder = damaged
+    pq.write_table(pa.table({"estimator": ["IMM"]}), folder / f"{name}.parquet")
+    with pytest.raises(UserError, match=rf"{name}.parquet: this file is damaged \(not") as caught:
+        read_table(folder, name)
+    sentence(caught)
+
+
+def test_a_part_of_runs_with_other_columns_is_one_sentence(tmp_path):
+    names = ["0000-000000-2", "0000-000001-2"]
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        folder.save_shard(names[0], {}, cells(0))
+        folder.save_shard(names[1], {}, [table.drop_columns("run") for table in cells(0)])
+        with pytest.raises(UserError, match=r"0001-2.parquet: this file is damaged") as caught:
+            folder.assemble_runs(names, 2)
+        sentence(caught)
 
 
 def test_a_shard_with_a_flipped_bit_is_noticed(damaged):
@@ -227,7 +322,7 @@ def test_truncated_tables_are_one_sentence(damaged, keep):
         cut(folder / f"{name}.parquet", keep)
     for use in (
         lambda: read_table(folder, "summary"),
-        lambda: read_run_sums(folder, "IMM", "all"),
+        lambda: next(run_sums(folder, "IMM", "all")),
         lambda: paired(folder, "IMM", "KF", "position_rmse_m", "all"),
         lambda: run(experiment, folder, 1, quiet),
     ):
@@ -251,7 +346,7 @@ def test_a_missing_table_is_one_sentence(damaged):
     _, folder = damaged
     for name in ("steps", "runs"):
         (folder / f"{name}.parquet").unlink()
-    for use in (lambda: read_table(folder, "steps"), lambda: read_run_sums(folder, "IMM", "all")):
+    for use in (lambda: read_table(folder, "steps"), lambda: next(run_sums(folder, "IMM", "all"))):
         with pytest.raises(UserError, match=r"missing from the run folder; .*--force") as caught:
             use()
         sentence(caught)
@@ -282,30 +377,68 @@ def test_a_shard_comes_back_as_it_was_put_away(tmp_path):
         assert not folder.has_shard("0")
         folder.save_shard("0", arrays, cells(0))
         assert folder.has_shard("0")
-        loaded = folder.load_shard("0")
+        loaded = folder.load_shard("0", dict)
     assert str(loaded["keys"]) == '{"a": 1}'
     assert loaded["steps"].tobytes() == arrays["steps"].tobytes()
 
 
 def test_runs_are_assembled_in_the_order_asked_for_from_old_and_new(tmp_path):
     runs = tmp_path / "run" / "runs.parquet"
+    zero, five, ten = "0000-000000-2", "0000-000005-2", "0000-000010-2"
     with RunFolder(tmp_path / "run", "d1") as folder:
-        for number in (0, 10):
-            folder.save_shard(str(number), {"a": np.zeros(1)}, cells(number))
-        folder.write_manifest({"digest": "d1"})
-        folder.assemble_runs(["0", "10"], 2)
-        folder.drop_parts(["0", "10"])
+        for name, number in ((zero, 0), (ten, 10)):
+            folder.save_shard(name, {"a": np.zeros(1)}, cells(number))
+        folder.assemble_runs([zero, ten], 2)
+        assert not runs.exists()
+        folder.publish({"digest": "d1"})
+        folder.drop_parts([zero, ten])
     assert pq.read_table(runs)["run"].to_pylist() == [0, 1, 0, 1, 10, 11, 10, 11]
     with RunFolder(tmp_path / "run", "d1") as folder:
-        assert folder.has_shard("10")
-        folder.save_shard("5", {"a": np.zeros(1)}, cells(5))
-        folder.assemble_runs(["5", "10"], 2)
-        folder.drop_parts(["5", "10"])
-        assert not folder.has_shard("0")
+        assert folder.has_shard(ten)
+        folder.save_shard(five, {"a": np.zeros(1)}, cells(5))
+        folder.assemble_runs([five, ten], 2)
+        folder.publish({"digest": "d1"})
+        folder.drop_parts([five, ten])
     table = pq.read_table(runs)
     assert table["run"].to_pylist() == [5, 6, 5, 6, 10, 11, 10, 11]
     assert table["estimator"].to_pylist() == ["raw", "raw", "IMM", "IMM"] * 2
-    assert sorted(p.name for p in (tmp_path / "run" / "shards").iterdir()) == ["10.npz", "5.npz"]
+    assert not (tmp_path / "run" / "unfinished").exists()
+
+
+def test_shards_that_have_grown_are_dropped_and_longer_ones_are_kept(tmp_path):
+    held, beyond, longer = "0000-000000-2048", "0000-000001-2048", "0001-000000-2048"
+    grown, own = "0000-000000-300", "0001-000000-300"
+    shards = tmp_path / "run" / "shards"
+    with RunFolder(tmp_path / "run", "d1") as folder:
+        for name in (grown, held, beyond, own, longer):
+            folder.save_shard(name, {}, cells(0))
+        (shards / "folder.npz").mkdir()
+        (shards / "mine.npz").touch()
+        folder.drop_parts([held, own])
+    kept = {f"{held}.npz", f"{own}.npz"}  # their runs are in runs.parquet
+    kept |= {f"{name}.{suffix}" for name in (beyond, longer) for suffix in ("npz", "parquet")}
+    assert {path.name for path in shards.iterdir()} == kept | {"folder.npz", "mine.npz"}
+
+
+def test_tables_stay_as_they_are_until_they_are_published(tmp_path):
+    names = SCHEMAS["published"].names
+    run_folder = tmp_path / "run"
+    manifest = {"digest": "d1"}
+    with RunFolder(run_folder, "d1") as folder:
+        folder.write_table("published", {name: [] for name in names})
+        folder.publish(manifest)
+    before = (run_folder / "published.parquet").read_bytes()
+    row = {field.name: pa.nulls(1, field.type) for field in SCHEMAS["published"]}
+    with RunFolder(run_folder, "d1") as folder:
+        folder.write_table("published", row)
+        assert (run_folder / "published.parquet").read_bytes() == before
+    with RunFolder(run_folder, "d1") as folder:
+        assert not folder.unfinished.exists()
+        assert (run_folder / "published.parquet").read_bytes() == before
+        folder.write_table("published", row)
+        folder.publish(manifest)
+    assert len(read_table(run_folder, "published")) == 1
+    assert read_manifest(run_folder) == manifest | {"status": "complete"}
 
 
 # ---- reading ---------------------------------------------------------------------------------
@@ -318,7 +451,7 @@ def test_require_complete(finished, tmp_path):
         with pytest.raises(UserError, match="this is no run folder; name one that") as caught:
             require_complete(path)
         sentence(caught)
-    (tmp_path / "manifest.json").write_text('{"status": "running"}')
+    (tmp_path / "manifest.json").write_text('{"status": "running", "digest": "d1"}')
     with pytest.raises(UserError, match="isn't complete; run its scenario again"):
         require_complete(tmp_path)
     assert read_manifest(tmp_path / "nothing") is None
@@ -329,20 +462,18 @@ def test_run_sums_are_the_rows_of_one_estimator_and_window(finished):
     table = pd.read_parquet(folder / "runs.parquet")
     for label in ("raw", "IMM", "RMIMM"):
         for window in experiment.windows:
-            sums, case, status = read_run_sums(folder, label, window.name)
+            (columns,) = run_sums(folder, label, window.name)  # five runs: one shard
             mine = table[(table["estimator"] == label) & (table["window"] == window.name)]
-            np.testing.assert_array_equal(case, mine["case_number"])
-            np.testing.assert_array_equal(status, mine["status"])
             assert len(mine) == experiment.runs
-            for quantity, (total, number) in sums.items():
-                np.testing.assert_array_equal(total, mine[f"{quantity}_sum"])
-                np.testing.assert_array_equal(number, mine[f"{quantity}_count"])
+            assert {"case_number", "status"} < columns.keys()
+            for name, values in columns.items():
+                np.testing.assert_array_equal(values, mine[name])
 
 
 @pytest.mark.parametrize(("estimator", "window"), [("XYZ", "all"), ("IMM", "xyz")])
 def test_run_sums_that_are_not_there_are_one_sentence(finished, estimator, window):
     with pytest.raises(UserError, match="holds no estimator") as caught:
-        read_run_sums(finished[1], estimator, window)
+        next(run_sums(finished[1], estimator, window))
     assert estimator in sentence(caught)
     assert window in sentence(caught)
 
@@ -351,6 +482,7 @@ def test_tables_have_their_schema_even_when_empty(tmp_path):
     names = SCHEMAS["published"].names
     with RunFolder(tmp_path / "run", "d1") as folder:
         folder.write_table("published", {name: [] for name in names})
+        folder.publish({"digest": "d1"})
     table = read_table(tmp_path / "run", "published")
     assert list(table.columns) == names
     assert table.empty

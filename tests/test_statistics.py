@@ -11,6 +11,7 @@ from hybridtrack.estimators import Estimates
 from hybridtrack.simulation import Scans, TruthSpan
 from hybridtrack.statistics import (
     METRICS,
+    POSITION_AT_SCANS,
     QUANTITIES,
     Moments,
     Names,
@@ -22,6 +23,7 @@ from hybridtrack.statistics import (
     compare,
     merge_moments,
     merge_sum_moments,
+    pair_moments,
     ratio_of_sums,
     score,
     score_measurements,
@@ -76,6 +78,10 @@ def slow_scores(scans, estimates, names):
                 shared = [s for s in states if s in truth and s in ours]
                 if shared and all(math.isfinite(ours[s]) for s in shared):
                     note(quantity, k, run, sum((ours[s] - truth[s]) ** 2 for s in shared))
+            if "position_squared_error_m2" in found:
+                missed = np.isnan(scans.measurements[k, :, run]).any()
+                error = found["position_squared_error_m2"][k, run]
+                note(POSITION_AT_SCANS, k, run, math.nan if missed else error)
             p = dict(zip(names.modes, estimates.mode_probabilities[k, :, run], strict=True))
             j = scans.truth.mode[k, here]
             mode = names.truth_modes[j] if j >= 0 else None
@@ -152,6 +158,7 @@ def test_scores_in_a_hand_case():
     )
     assert {name: float(value[0, 0]) for name, value in quantities.items()} == {
         "position_squared_error_m2": 25.0,  # 3-4-5
+        POSITION_AT_SCANS: 25.0,
         "velocity_squared_error_m2_s2": 1.0,
         "likelihood_distinctness": pytest.approx(0.2, rel=ROUNDING),
         "mode_correct": 1.0,
@@ -162,7 +169,8 @@ def test_scores_in_a_hand_case():
     assert advantage[0, 0] == pytest.approx(-0.2, rel=ROUNDING)
     raw = score_measurements(scans, TRUTH_STATES)
     assert {name: float(value[0, 0]) for name, value in raw.items()} == {
-        "position_squared_error_m2": 10.0
+        "position_squared_error_m2": 10.0,
+        POSITION_AT_SCANS: 10.0,
     }
 
 
@@ -213,7 +221,11 @@ def test_quantities_follow_from_the_names(truth_modes, modes, kept):
     quantities, advantage = score(
         scans, estimates, Names(TRUTH_STATES, truth_modes, SIX_STATES, modes)
     )
-    assert set(quantities) == kept | {"position_squared_error_m2", "velocity_squared_error_m2_s2"}
+    assert set(quantities) == kept | {
+        "position_squared_error_m2",
+        POSITION_AT_SCANS,
+        "velocity_squared_error_m2_s2",
+    }
     assert advantage is None
 
 
@@ -256,7 +268,8 @@ def test_an_advantage_is_kept_or_not_or_unknown():
 
 def test_every_quantity_has_a_metric_that_says_which_way_is_better():
     assert {metric.better for metric in METRICS.values()} == {"less", "greater"}
-    assert set(QUANTITIES) == {metric.quantity for metric in METRICS.values()}
+    scored = {metric.quantity for metric in METRICS.values()}
+    assert set(QUANTITIES) == scored | {POSITION_AT_SCANS}
     assert all(metric.root == ("rmse" in name) for name, metric in METRICS.items())
 
 
@@ -483,6 +496,10 @@ def test_ratios_that_are_not_there():
 # ---- pairs -----------------------------------------------------------------------------------
 
 
+def compared(first, second, root):
+    return compare(pair_moments(first, second), root)
+
+
 def pair(rng, sizes):
     """Two estimators whose errors rise and fall together over the same runs."""
     n = sum(sizes)
@@ -514,7 +531,7 @@ def bootstrapped(first, second, root, rng, resamples=4000):
 @pytest.mark.parametrize("sizes", [(300,), (80, 120)])
 def test_pairs_have_the_bootstraps_error(sizes, root):
     first, second = pair(np.random.default_rng(14), sizes)
-    ours = compare(first, second, root)
+    ours = compared(first, second, root)
     difference, ratio = bootstrapped(first, second, root, np.random.default_rng(15))
     # A deviation of 4000 resamples is known to 1.1 %; the bootstrap lacks Bessel's factor, 0.6 %
     # at 80 runs, and is no linearisation, 1/n again.
@@ -533,7 +550,7 @@ def test_pairs_have_the_bootstraps_error(sizes, root):
 @pytest.mark.parametrize("root", [False, True])
 def test_a_pair_is_the_two_metrics_difference_and_ratio(root):
     first, second = pair(np.random.default_rng(16), (50, 30))
-    ours, turned = compare(first, second, root), compare(second, first, root)
+    ours, turned = compared(first, second, root), compared(second, first, root)
     values = [pooled([(r.sums, r.numbers)], root) for r in (first, second)]
     assert (ours.first, ours.second) == pytest.approx(values, rel=ROUNDING)
     assert ours.difference.value == pytest.approx(values[0] - values[1], rel=ROUNDING)
@@ -551,7 +568,7 @@ def test_the_true_ratio_lies_within_two_standard_errors():
     repetitions = 400
     within = {"difference": 0, "ratio": 0}
     for _ in range(repetitions):
-        ours = compare(*pair(rng, (150,)), root=True)
+        ours = compared(*pair(rng, (150,)), root=True)
         # Mean errors are .9 * 90 and 90 m^2.
         truth = {"difference": math.sqrt(81.0) - math.sqrt(90.0), "ratio": math.sqrt(0.9)}
         for name, estimate in (("difference", ours.difference), ("ratio", ours.ratio)):
@@ -569,7 +586,7 @@ def test_a_pair_in_a_hand_case():
     case, numbers, sound = np.zeros(3, dtype=np.int64), np.ones(3), np.ones(3, dtype=bool)
     first = RunSums(case, np.array([2.0, 4.0, 6.0]), numbers, sound)
     second = RunSums(case, np.array([1.0, 3.0, 2.0]), numbers, sound)
-    ours = compare(first, second, root=False)
+    ours = compared(first, second, root=False)
     assert ours.difference == (2.0, pytest.approx(1.0, rel=ROUNDING), 3)
     assert ours.ratio == (2.0, pytest.approx(1 / math.sqrt(3), rel=ROUNDING), 3)
 
@@ -583,12 +600,12 @@ def test_a_run_that_diverged_under_either_leaves_both():
     spoiled_2[[7, 20]] = np.inf
     no_steps = second.numbers.copy()
     no_steps[31] = 0.0  # sound, but with no step in the window
-    ours = compare(
+    ours = compared(
         first._replace(sums=spoiled_1, sound=np.isfinite(spoiled_1)),
         second._replace(sums=spoiled_2, numbers=no_steps, sound=np.isfinite(spoiled_2)),
         root=True,
     )
-    expected = compare(
+    expected = compared(
         *(
             RunSums(r.case[kept], r.sums[kept], r.numbers[kept], r.sound[kept])
             for r in (first, second)
@@ -602,19 +619,19 @@ def test_a_run_that_diverged_under_either_leaves_both():
 @pytest.mark.parametrize("root", [False, True])
 def test_identical_estimators_have_the_ratio_1_and_no_error(root):
     first, _ = pair(np.random.default_rng(19), (30, 20))
-    ours = compare(first, first, root)
+    ours = compared(first, first, root)
     assert ours.difference == (0.0, 0.0, 50)
     assert ours.ratio == (1.0, 0.0, 50)
 
 
 def test_pairs_that_are_not_there():
     first, second = pair(np.random.default_rng(20), (5,))
-    none = compare(first._replace(sound=np.zeros(5, dtype=bool)), second, root=True)
+    none = compared(first._replace(sound=np.zeros(5, dtype=bool)), second, root=True)
     assert none.difference.n_runs == none.ratio.n_runs == 0
     assert math.isnan(none.ratio.value)
-    flawless = compare(first, second._replace(sums=np.zeros(5)), root=True)
+    flawless = compared(first, second._replace(sums=np.zeros(5)), root=True)
     assert flawless.difference.value == flawless.first
     assert math.isnan(flawless.ratio.value)
-    lonely = compare(*(RunSums(*(field[:1] for field in r)) for r in (first, second)), root=True)
+    lonely = compared(*(RunSums(*(field[:1] for field in r)) for r in (first, second)), root=True)
     assert lonely.difference.n_runs == 1
     assert math.isnan(lonely.difference.standard_error)

@@ -9,6 +9,7 @@ from hybridtrack.statistics import NOTHING, Estimate, Paired
 from hybridtrack.verdicts import (
     ASSUMED,
     DIRECTION,
+    NO_DATA,
     NOT_REPRODUCED,
     REPRODUCED,
     UNDECIDED,
@@ -176,6 +177,12 @@ def test_one_run_decides_nothing(value):
     assert comparison(-value, math.nan, n=1) == UNDECIDED
     ratio = Estimate(value, math.nan, 1)
     assert comparison(-1.0, math.nan, n=1, value=0.8, tolerance=0.01, ratio=ratio) == UNDECIDED
+
+
+def test_a_window_without_steps_is_not_a_lack_of_runs():
+    assert figure(*NOTHING[:2], n_runs=0) == NO_DATA
+    assert comparison(*NOTHING[:2], n=0) == NO_DATA
+    assert not judge_figure(claim(18.0, 0.5), NOTHING, assumptions=False).differs
 
 
 @pytest.mark.parametrize("n_runs", [2, 3, 5, 10, 30])

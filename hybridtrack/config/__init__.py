@@ -39,14 +39,20 @@ def shipped() -> dict[str, Path]:
 def find(config: str) -> Path:
     """The file of a scenario given by its path, or by the name of a shipped one."""
     path = Path(config)
-    if path.exists() or config not in shipped():
-        if not path.exists() and not path.suffix and path.name == config:
-            raise ScenarioError(
-                f"{config}: there is no such file, and no scenario of that name is shipped; "
-                f"{nearest(config, tuple(shipped()))}"
-            )
+    try:
+        found = path.exists() and not (path.is_dir() and config in shipped())
+    except OSError:
+        found = True  # reading it tells what is in the way
+    if found:
         return path
-    return shipped()[config]
+    if config in shipped():
+        return shipped()[config]
+    if not path.suffix and path.name == config:
+        raise ScenarioError(
+            f"{config}: there is no such file, and no scenario of that name is shipped; "
+            f"{nearest(config, tuple(shipped()))}"
+        )
+    return path
 
 
 def load(config: str | Path, settings: Sequence[str] = ()) -> Experiment:

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from hybridtrack.config import banks, checks, starts, truths
-from hybridtrack.config.description import ChosenEstimator, Experiment, Window
+from hybridtrack.config.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.config.reader import Document, Keys, ScenarioError
 from hybridtrack.config.schema import ClaimForm, Form, ScenarioForm, WindowForm
 from hybridtrack.errors import UserError
 from hybridtrack.estimators import estimators
 from hybridtrack.models import Array, ModeBank
-from hybridtrack.simulation import Case
+from hybridtrack.simulation import Case, FixedTruth
 from hybridtrack.statistics import METRICS
 from hybridtrack.verdicts import Claim, printed_tolerance
 
@@ -28,6 +28,7 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         raise document.error(
             ("initial", "from_measurements"), "a start from two scans needs three steps or more"
         )
+    _check_recorded(form, cases, initial, document)
     banks.try_out(bank, steps, document, ())
     chosen = tuple(_estimator(label, form, bank, steps, document) for label in form.estimators)
     if form.compare_with is not None and form.compare_with not in form.estimators:
@@ -68,12 +69,42 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
     )
 
 
+def _check_recorded(
+    form: ScenarioForm, cases: tuple[Case, ...], initial: Initial, document: Document
+) -> None:
+    """Recorded measurements leave nothing to draw, and no truth to start from but a reference's."""
+    for case in cases:
+        if case.recorded is None:
+            continue
+        if form.monte_carlo.runs > 1:
+            raise document.error(
+                ("monte_carlo", "runs"),
+                "recorded measurements are the same in every run; set 'runs' to 1",
+            )
+        assert isinstance(case.truth, FixedTruth)
+        if initial.follows_truth and np.isnan(case.truth.state[0]).any():
+            raise document.error(
+                ("initial", "mean"),
+                f"the truth at the first scan of '{case.name}' is unknown, so no filter can start "
+                "there; give 'from_measurements: two_point' instead",
+            )
+
+
+# Rows of the tables, and how the figures' legends call them.
+TAKEN_LABELS = ("raw", "truth", "measurement", "measurements")
+
+
 def _estimator(
     label: str, form: ScenarioForm, bank: ModeBank, steps_s: Sequence[Array], document: Document
 ) -> ChosenEstimator:
-    if label in ("raw", "truth"):
+    if label in TAKEN_LABELS:
         raise document.error(
-            ("estimators", label), f"'{label}' names a row of every table; call it otherwise"
+            ("estimators", label),
+            f"'{label}' means something else in tables and figures; call it otherwise",
+        )
+    if label.startswith("_"):  # no legend of matplotlib's shows these
+        raise document.error(
+            ("estimators", label), f"'{label}' begins with _; begin with a letter or a digit"
         )
     chosen: Any = form.estimators[label]
     estimator = estimators()[chosen.type]

@@ -256,7 +256,7 @@ class ClaimForm(Form):
     """A published claim: a figure of one estimator, or a comparison of two."""
 
     claim: str
-    metric: str
+    metric: Annotated[str, Field(json_schema_extra={"enum": [*METRICS]})]
     estimator: str | None = None
     compare: Annotated[list[str], Field(min_length=2, max_length=2)] | None = None
     window: str = "all"
@@ -306,6 +306,7 @@ class ScenarioForm(Form):
 def json_schema() -> dict[str, Any]:
     """JSON Schema of a scenario for editors, every unit's spelling included."""
     schema = ScenarioForm.model_json_schema()
+    _refuse_other_names(schema)
     for form in (schema, *schema["$defs"].values()):
         properties = form.get("properties", {})
         for name in list(properties):
@@ -319,6 +320,17 @@ def json_schema() -> dict[str, Any]:
                 )
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return schema
+
+
+def _refuse_other_names(node: Any) -> None:
+    """Names by `propertyNames`: `patternProperties` alone lets every other key pass unchecked."""
+    parts = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    for part in parts:
+        _refuse_other_names(part)
+    if isinstance(node, dict) and "patternProperties" in node:
+        ((pattern, value),) = node.pop("patternProperties").items()
+        node["additionalProperties"] = value
+        node["propertyNames"] = {**node.get("propertyNames", {}), "pattern": pattern}
 
 
 def is_number(value: Any) -> bool:

@@ -1,12 +1,14 @@
 """Truth and sensor: the clock, legs flown, chains simulated, recordings read."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from hybridtrack.config import banks, checks, recorded, starts
 from hybridtrack.config.reader import Document, Keys
-from hybridtrack.config.schema import ScenarioForm, TruthForm
+from hybridtrack.config.schema import FileForm, RecordingForm, ScenarioForm, TruthForm
+from hybridtrack.config.validate import as_written
 from hybridtrack.errors import UserError
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.simulation import Case, ChainTruth, FixedTruth, Leg, Sensor, fly
@@ -36,7 +38,8 @@ def cases(
         try:
             return (), recorded.cases(truth.recording, folder)
         except UserError as error:
-            raise document.error(("truth", "recording"), str(error)) from None
+            place = _recording_place(truth.recording, str(error), document)
+            raise document.error(place, str(error)) from None
     times_s = _times(form, document)
     if truth.legs is not None:
         fixed = _legs(form, truth, times_s, bank.names, document)
@@ -67,6 +70,28 @@ def cases(
         )
     chain = ChainTruth(truth_bank, start.mean, start.covariance)
     return truth_bank.names, (Case(form.name, times_s, chain),)
+
+
+def _recording_place(recording: RecordingForm, sentence: str, document: Document) -> Keys:
+    """The key that a complaint about a recording names, or whose value it is about."""
+    path: Keys = ("truth", "recording")
+    holder: FileForm = recording
+    other = None if _is_about(recording, sentence) else recording.reference
+    if other is not None and ("reference" in sentence or _is_about(other, sentence)):
+        path, holder = (*path, "reference"), other
+    keys = [key.strip("`") for key in re.findall(r"`\w+`|[a-z]+_[a-z_]+", sentence)]
+    keys += ["file"] if Path(holder.file).name in sentence else []
+    keys += ["package"] if holder.package and holder.package in sentence else []
+    for key in keys:
+        for location in ((*path, key), (*path, "columns", key)):
+            written = as_written(document, location)
+            if len(written) == len(location):
+                return written
+    return path
+
+
+def _is_about(form: FileForm, sentence: str) -> bool:
+    return Path(form.file).name in sentence or bool(form.package and form.package in sentence)
 
 
 def _times(form: ScenarioForm, document: Document) -> Array:

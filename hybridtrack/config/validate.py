@@ -22,13 +22,18 @@ def validate(document: Document) -> ScenarioForm:
         form = ScenarioForm.model_validate(document.data)
     except ValidationError as error:
         raise _first_mistake(document, error) from None
-    for path, number in _numbers(document.data, ()):
-        if number and not SMALLEST <= abs(number) <= LARGEST:
-            raise document.error(
-                path,
-                f"{_label(path)} is {_shown(document, path)}; a number here is 0 or of a size "
-                f"between {SMALLEST:g} and {LARGEST:g}",
-            )
+    outside = [
+        as_written(document, location)
+        for location, number in _numbers(form.model_dump(by_alias=True), ())
+        if number and not SMALLEST <= abs(number) <= LARGEST
+    ]
+    if outside:
+        path = min(outside, key=document.position)
+        raise document.error(
+            path,
+            f"{_label(path)} is {_shown(document, path)}; a number here is 0 or of a size "
+            f"between {SMALLEST:g} and {LARGEST:g} in SI units",
+        )
     return form
 
 

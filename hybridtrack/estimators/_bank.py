@@ -7,8 +7,10 @@ memory, and the compiler turns it into vector instructions. A cycle has the IMM'
     predict_mode_probabilities -> mix -> predict -> update -> weigh_modes (-> combine)
 
 The covariances are packed lower triangles: element (a, c), a >= c, stands at a (a + 1)/2 + c.
-Mode probabilities are kept as logarithms too, so that the evidence against a mode may exceed the
-range of a float without being forgotten: a static bank can still come back from e**-2000.
+Mode probabilities are kept as logarithms too, so that the evidence against a mode that nothing
+else feeds (a static bank, an absorbing mode) may exceed the range of a float without being
+forgotten: it can still come back from e**-2000. Modes that feed one another and are all below
+e**-745 together are forgotten.
 """
 
 from typing import Any, NamedTuple

@@ -1,4 +1,10 @@
-"""The Kalman update of one mode, lanes last, as accurate as Joseph's form."""
+"""The Kalman update of one mode, lanes last, as accurate as Joseph's form.
+
+No update of a covariance keeps digits beyond those of the covariance itself: with P0/R near 1e16
+and no process noise, small variances are all rounding after a scan or two. Two bounds that every
+exact covariance meets keep rounding from turning variances negative there: S >= R, and
+P_aa >= K_a R K_a.
+"""
 
 import numpy as np
 
@@ -11,7 +17,8 @@ def _innovate(y, mean, coefficient, variance, position_variance, out, inverse, s
     """Innovation of a scalar measurement; where it is missing, an update of no effect."""
     for b in range(y.size):
         detected = y[b] == y[b]
-        s = coefficient * coefficient * position_variance[b] + variance
+        known = 0.0 if position_variance[b] < 0.0 else position_variance[b]  # NaN stays NaN
+        s = coefficient * coefficient * known + variance
         innovation = y[b] - coefficient * mean[b] if detected else 0.0
         inverse[b] = 1.0 / s if detected else 0.0
         out[b] = innovation
@@ -20,13 +27,23 @@ def _innovate(y, mean, coefficient, variance, position_variance, out, inverse, s
 
 
 @kernel
+def _bound_variances(covariance, gains, variance):
+    """P_aa >= r K_a^2, the share of the measurement's own noise in the estimate."""
+    for a in range(gains.shape[0]):
+        row = covariance[packed(a, a)]
+        for b in range(row.size):
+            least = variance * gains[a, b] * gains[a, b]
+            row[b] = least if row[b] < least else row[b]
+
+
+@kernel
 def _update_by_component(
     mean, covariance, component, coefficient, variance, y, squared, scale, work
 ):
     """Update by a scalar measurement coefficient x[component] + noise.
 
-    The measured row of P is scaled by r/s instead of subtracted from, which keeps every digit
-    that Joseph's form keeps, at half its cost.
+    The measured row of P is scaled by r/s instead of subtracted from: Joseph's digits there at
+    half its cost; elsewhere his correction is no larger than the rounding of P itself.
     """
     n_x = mean.shape[0]
     innovation, inverse, gain = work.rows[3], work.rows[4], work.rows[5]
@@ -68,6 +85,7 @@ def _update_by_component(
     for e in range(n_x):  # the rows become the gain, for whoever needs it afterwards
         for b in range(innovation.size):
             rows[e, b] *= inverse[b]
+    _bound_variances(covariance, rows, variance)
 
 
 @kernel
@@ -111,6 +129,7 @@ def _update_by_combination(mean, covariance, h, variance, y, squared, scale, wor
                 correction = products[a, b] * gains[c, b] + products[c, b] * gains[a, b]
                 # Where the measurement is missing the gain is 0, and the correction with it.
                 out[b] -= 0.5 * correction
+    _bound_variances(covariance, gains, variance)
 
 
 @kernel

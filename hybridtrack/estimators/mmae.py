@@ -16,7 +16,8 @@ from hybridtrack.motion import white_acceleration_covariance
 class Settings(NamedTuple):
     """Maybeck's remedies, both off by default.
 
-    mode_probability_floor: no mode's probability falls below it (then all are normalised);
+    mode_probability_floor: smaller mode probabilities are raised to it, those of 0 too, and then
+    all are normalised, so that they end a little below it;
     added_acceleration_std_m_s2: white acceleration added to every mode's process noise.
     """
 

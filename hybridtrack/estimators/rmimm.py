@@ -9,9 +9,10 @@ mean errors mixed the same way, y_j = x0_j + ebar0_j and b_i the input's effect:
     ebar_j(k) = (sum_i w_i A_i) y_j - A_j x0_j + sum_i w_i b_i - b_j - K_j rbar_j,   ebar(0) = 0
     N_j       = 1/max(||rbar_j||, floor),   mu_j(k) proportional to N_j Lambda_j mu-_j(k)
 
-The mixing of ebar, the use of x0 and the floor are ours: unmixed, the mean residual of a filter
-that is always right vanishes, and the printed N (a floor of 0) locks the filter into one mode.
-With an infinite floor it is the IMM.
+The mixing of ebar, the use of x0 and the floor are ours. Unmixed, the mean residual of a filter
+whose states add nothing to the others' predictions is 0 for ever (the CV filter of figure 5, its
+acceleration zeroed); and the printed N (no floor) holds the filter in one mode far into a turn. With
+an infinite floor it is the IMM.
 """
 
 from typing import Literal, NamedTuple

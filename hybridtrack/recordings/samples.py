@@ -1,7 +1,6 @@
-"""Recorded flights: from a file to tracks in a local plane, thinned and smoothed.
+"""A recording's file as samples: which file, which of its columns, which row in which track.
 
-A recording is a table with one row per report: CSV, JSON or Parquet. What comes out is SI:
-seconds since a track's first sample, metres east and north.
+What comes out is SI for times and heights; positions are as the file has them.
 """
 
 from __future__ import annotations
@@ -18,19 +17,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from hybridtrack.errors import UserError
 
-FloatArray = NDArray[np.float64]
-
-MINIMUM_SAMPLES = 10
-"""A track with fewer usable samples is an error."""
-
-MINIMUM_WINDOW_SAMPLES = 6
-"""`smooth` answers NaN where its window holds fewer: a cubic has four coefficients."""
-
-_TIME_TOLERANCE_S = 1e-9
 _METRES_PER = {"ft": 0.3048, "m": 1.0}
 
 # Lower-case names in order of preference. `track` is no track's id: in surveillance tables it
@@ -49,20 +38,6 @@ _USUAL_IDS = (("flight_id",), ("track_id",), ("icao24", "callsign"), ("icao24",)
 # day of March 1973; a smaller number is plain seconds.
 _EPOCH_UNITS: tuple[tuple[float, Literal["ns", "us", "ms", "s"]], ...]
 _EPOCH_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
-
-
-class Track(NamedTuple):
-    """One recorded track in a local tangent plane."""
-
-    name: str
-    time_s: FloatArray
-    """(n,) seconds since `epoch`, increasing; the first is 0. Gaps are kept."""
-    position_m: FloatArray
-    """(n, 2) east and north, metres."""
-    epoch: str
-    """ISO 8601 time (UTC) of the first sample; empty where the file has plain seconds."""
-    origin_deg: tuple[float, float] | None = None
-    """Latitude and longitude where the plane touches; None where the file has x and y."""
 
 
 class Source(NamedTuple):
@@ -88,34 +63,33 @@ class Source(NamedTuple):
     """Rows lower than this, or without an altitude, are dropped."""
     altitude_unit: Literal["ft", "m"] = "ft"
     folder: Path = Path()
-    origin_deg: tuple[float, float] | None = None
-    """Where the plane touches, so that two recordings share one; by default each track's start."""
 
 
-def read_tracks(source: Source) -> list[Track]:
-    """Read the tracks of a recording, in order of first appearance.
+class Samples(NamedTuple):
+    """A recording's rows as they stand, NaN where a value is missing or no number."""
 
-    Per track and in this order: rows without time or position are dropped; the rest is sorted
-    by time; rows below `minimum_altitude_m` are dropped, then duplicate times (the first is
-    kept), then held positions: a transponder without a new fix repeats its last one exactly.
+    rows: pd.DataFrame
+    """Columns track, time_s, first, second and altitude_m: latitude and longitude in degrees
+    where `geographic`, else metres east and north."""
+    start: pd.Timestamp | None
+    """What `time_s` counts from; None where the file has plain seconds."""
+    geographic: bool
 
-    Times are ISO 8601 text (UTC where no zone is given), datetimes, or numbers: since 1970 in
-    s, ms, us or ns where they are as large as that, plain seconds otherwise. Latitude and
-    longitude (degrees, WGS84) go to the plane that touches the ellipsoid at the track's first
-    kept position. All heights are taken as 0, so a distance d from there appears short by about
-    d^3 / (6 R^2): 4 m at 100 km, 33 m at 200 km.
+
+def read_samples(source: Source) -> Samples:
+    """Read the rows of a recording.
 
     Raises:
         UserError: no such file or package, a file that can't be read, a missing or empty
-            column, a latitude or longitude out of range, or a track with fewer than
-            `MINIMUM_SAMPLES` usable samples.
+            column, or a latitude or longitude out of range.
     """
     table = _read_table(source)
     names = _track_names(table, source)
     elapsed_s, start = _elapsed_seconds(table, _column(table, source, "time"), source)
     first, second, geographic = _position_columns(table, source)
-    samples = pd.DataFrame(
+    rows = pd.DataFrame(
         {
+            "track": names,
             "time_s": elapsed_s,
             "first": _numbers(table, first, source),
             "second": _numbers(table, second, source),
@@ -123,69 +97,9 @@ def read_tracks(source: Source) -> list[Track]:
         }
     )
     if geographic:
-        _check_range(samples["first"], first, -90.0, 90.0, source)
-        _check_range(samples["second"], second, -180.0, 360.0, source)
-    return [
-        _track(str(name), rows, start, geographic, source)
-        for name, rows in samples.groupby(names, sort=False)
-    ]
-
-
-def thin(time_s: FloatArray, every_s: float) -> NDArray[np.intp]:
-    """Indices (k,) that thin increasing times (n,) to at least `every_s` apart.
-
-    The recording's own uneven times stay: the first, then greedily each first one at least
-    `every_s` after the last kept.
-
-    Raises:
-        UserError: `every_s` isn't positive.
-    """
-    if not every_s > 0.0:
-        raise UserError(f"a recording can't be thinned to {every_s} s: give a positive interval")
-    kept = []
-    index = 0
-    while index < len(time_s):
-        kept.append(index)
-        earliest = time_s[index] + every_s - _TIME_TOLERANCE_S
-        # At least one further: `every_s` itself may be below the tolerance.
-        index = max(index + 1, int(np.searchsorted(time_s, earliest)))
-    return np.array(kept, dtype=np.intp)
-
-
-def smooth(
-    track: Track, at_time_s: FloatArray, half_window_s: float = 8.0
-) -> tuple[FloatArray, FloatArray]:
-    """Position (k, 2) in m and velocity (k, 2) in m/s of a track at times (k,).
-
-    A cubic is fitted by least squares, equal weights, to the samples within `half_window_s` of
-    each time; its value and slope there are the answer (local polynomial regression: Fan and
-    Gijbels 1996, section 3.1; on even times Savitzky and Golay 1964).
-
-    Where the window holds fewer than `MINIMUM_WINDOW_SAMPLES`, or none on one side of the time,
-    both are NaN: in gaps and beyond the ends nothing is extrapolated. At the very ends the
-    window is one-sided and the slope several times less certain.
-
-    Raises:
-        UserError: `half_window_s` isn't positive.
-    """
-    if not half_window_s > 0.0:
-        raise UserError(f"half a window of {half_window_s} s holds no samples: give a positive one")
-    time_s, reach_s = track.time_s, half_window_s + _TIME_TOLERANCE_S
-    at_time_s = np.asarray(at_time_s, dtype=np.float64)
-    starts = np.searchsorted(time_s, at_time_s - reach_s)
-    stops = np.searchsorted(time_s, at_time_s + reach_s, side="right")
-    position = np.full((len(at_time_s), 2), np.nan)
-    velocity = np.full((len(at_time_s), 2), np.nan)
-    for k in np.flatnonzero(stops - starts >= MINIMUM_WINDOW_SAMPLES):
-        window = slice(starts[k], stops[k])
-        # Centred and scaled to -1 .. 1, the powers stay of one size whatever the times.
-        offset = (time_s[window] - at_time_s[k]) / half_window_s
-        if offset[0] <= 0.0 <= offset[-1]:
-            powers = np.vander(offset, 4, increasing=True)
-            coefficients = np.linalg.lstsq(powers, track.position_m[window], rcond=None)[0]
-            position[k] = coefficients[0]
-            velocity[k] = coefficients[1] / half_window_s
-    return position, velocity
+        _check_range(rows["first"], first, -90.0, 90.0, source)
+        _check_range(rows["second"], second, -180.0, 360.0, source)
+    return Samples(rows, start, geographic)
 
 
 def _locate(source: Source) -> Path:
@@ -353,7 +267,7 @@ def _altitude(table: pd.DataFrame, source: Source) -> pd.Series[float] | float:
 def _elapsed_seconds(
     table: pd.DataFrame, column: str, source: Source
 ) -> tuple[pd.Series[float], pd.Timestamp | None]:
-    """Seconds since the table's earliest time, and that time where it is a date."""
+    """Seconds since the table's earliest date, and that; plain seconds as they stand."""
     values = table[column]
     if not pd.api.types.is_datetime64_any_dtype(values):
         numbers = _finite(values)
@@ -361,7 +275,7 @@ def _elapsed_seconds(
             typical = numbers.abs().median()
             unit = next((unit for limit, unit in _EPOCH_UNITS if typical >= limit), None)
             if unit is None:
-                return numbers - numbers.min(), None
+                return numbers, None
             values = pd.to_datetime(numbers, unit=unit, utc=True, errors="coerce")
     # Rounded: as a float, a time since 1970 is up to 0.2 us off, enough to make 4 s less than 4 s.
     dates = pd.to_datetime(values, utc=True, format="ISO8601", errors="coerce").dt.round("us")
@@ -380,56 +294,3 @@ def _check_range(
             f"{outside.iloc[0]:g} in column {column!r} of {source.file!r} isn't within "
             f"{low:g} to {high:g} degrees: mend it, or name metres under `x` and `y`"
         )
-
-
-def _usable(samples: pd.DataFrame, minimum_altitude_m: float | None) -> pd.DataFrame:
-    rows = samples.dropna(subset=["time_s", "first", "second"])
-    rows = rows.sort_values("time_s", kind="stable")
-    if minimum_altitude_m is not None:
-        rows = rows[rows["altitude_m"] >= minimum_altitude_m]
-    rows = rows.drop_duplicates("time_s")
-    position = rows[["first", "second"]]
-    return rows[~(position == position.shift()).all(axis="columns")]
-
-
-def _track(
-    name: str, samples: pd.DataFrame, start: pd.Timestamp | None, geographic: bool, source: Source
-) -> Track:
-    rows = _usable(samples, source.minimum_altitude_m)
-    if len(rows) < MINIMUM_SAMPLES:
-        raise UserError(
-            f"track {name!r} of {source.file!r} has {len(rows)} usable samples out of "
-            f"{len(samples)}, fewer than {MINIMUM_SAMPLES}: take it out of the file, or change "
-            "`minimum_altitude_m` or the column under `track`"
-        )
-    time_s = rows["time_s"].to_numpy(np.float64)
-    position = rows[["first", "second"]].to_numpy(np.float64)
-    origin = None
-    if geographic:
-        origin = source.origin_deg or (float(position[0, 0]), float(position[0, 1]))
-        position = _local_plane(position, origin)
-    return Track(
-        name=name,
-        time_s=time_s - time_s[0],
-        position_m=position,
-        epoch="" if start is None else _iso(start, time_s[0]),
-        origin_deg=origin,
-    )
-
-
-def _iso(start: pd.Timestamp, elapsed_s: float) -> str:
-    return (start + pd.Timedelta(seconds=elapsed_s)).round("us").isoformat()
-
-
-def _local_plane(position_deg: FloatArray, origin_deg: tuple[float, float]) -> FloatArray:
-    """East and north (n, 2) in m of latitude and longitude (n, 2) in degrees."""
-    try:
-        from pymap3d import geodetic2enu
-    except ImportError as error:
-        raise UserError(
-            "latitude and longitude need pymap3d, which is not installed: "
-            'pip install "hybridtrack[recordings]"'
-        ) from error
-    latitude, longitude = position_deg.T
-    east, north, _ = geodetic2enu(latitude, longitude, 0.0, *origin_deg, 0.0)
-    return np.column_stack([east, north])
