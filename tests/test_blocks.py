@@ -18,7 +18,7 @@ from hybridtrack.blocks import (
 )
 from hybridtrack.config import Window
 from hybridtrack.executors import Stopped
-from hybridtrack.experiment import run
+from hybridtrack.experiment import run as run_experiment
 from hybridtrack.outcomes import paired
 from hybridtrack.simulation import (
     BLOCK_RUNS,
@@ -507,7 +507,7 @@ def test_raw_is_compared_at_the_scans_that_were_not_missed(tmp_path):
     assert numbers.tolist() == raw_numbers.tolist()
     assert numbers.sum() < 0.6 * steps.sum()
     assert at_scans.sum() / numbers.sum() < 0.8 * everywhere.sum() / steps.sum()
-    run(experiment, tmp_path / "run", 1, lambda done, total: None)
+    run_experiment(experiment, tmp_path / "run", 1, lambda done, total: None)
     pair = paired(tmp_path / "run", "raw", "IMM", "position_mse_m2", "all")
     # rounding: sums of some 1,000 terms in another order
     assert pair.second == pytest.approx(at_scans.sum() / numbers.sum(), rel=1e-12)

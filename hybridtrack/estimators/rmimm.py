@@ -11,8 +11,8 @@ mean errors mixed the same way, y_j = x0_j + ebar0_j and b_i the input's effect:
 
 The mixing of ebar, the use of x0 and the floor are ours. Unmixed, the mean residual of a filter
 whose states add nothing to the others' predictions is 0 for ever (the CV filter of figure 5, its
-acceleration zeroed); and the printed N (no floor) holds the filter in one mode far into a turn. With
-an infinite floor it is the IMM.
+acceleration zeroed); and the printed N (no floor) holds the filter in one mode far into a turn.
+With an infinite floor it is the IMM.
 """
 
 from typing import Literal, NamedTuple
