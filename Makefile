@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 # The recorded flight lies inside this package; what it would install besides is not needed.
 FLIGHT = traffic==2.13
 
-.PHONY: run test ordeals check ledger clean
+.PHONY: run test ordeals check bench ledger clean
 
 run: $(VENV)/.installed
 	$(BIN)/hybridtrack run configs/rmimm_fig5.yaml
@@ -21,6 +21,9 @@ check: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
+
+bench: $(VENV)/.installed
+	$(BIN)/python benchmarks/run.py
 
 ledger: $(VENV)/.installed
 	$(BIN)/python tests/readme.py
