@@ -18,11 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridtrack.compiled import exp, kernel, log
+from hybridtrack.compiled import exp, lane_kernel, log
 from hybridtrack.estimators._lanes import (
     add_scaled,
+    aligned_zeros,
     apply,
     copy,
+    copy_all,
     fill,
     merge,
     merge_mean,
@@ -100,7 +102,7 @@ class Estimates(NamedTuple):
 # ---- the five steps --------------------------------------------------------------------------
 
 
-@kernel
+@lane_kernel
 def predict_mode_probabilities(state, work, transition):
     """c_j = sum_i p_ij mu_i (Hwang 2006, eq. 6; row = from), and its logarithm.
 
@@ -127,7 +129,7 @@ def predict_mode_probabilities(state, work, transition):
                 log_predicted[b] = log(predicted[b])
 
 
-@kernel
+@lane_kernel
 def mix(state, work, transition, interaction, errors):
     """Each mode's start of the cycle: the merged state of the modes it may come from.
 
@@ -147,31 +149,57 @@ def mix(state, work, transition, interaction, errors):
                 first = j
         elif interaction == INHERIT:
             first = 0
-        mean[:] = state.mean[first]
-        covariance[:] = state.covariance[first]
         if errors:
-            work.mixed_error[j, :] = state.residual_error[first]
+            copy_all(work.mixed_error[j], state.residual_error[first])
         if interaction == NO_INTERACTION:
+            copy_all(mean, state.mean[first])
+            copy_all(covariance, state.covariance[first])
             continue
         set_scaled(
             total,
             transition[first, j] if interaction == MIXING else 1.0,
             state.mode_probabilities[first],
         )
+        merged = False
         for i in range(first + 1, n_modes):
             factor = transition[i, j] if interaction == MIXING else 1.0
             if factor == 0.0:
                 continue
             merge_share(total, share, factor, state.mode_probabilities[i])
-            merge(mean, covariance, share, state.mean[i], state.covariance[i], work.states[0])
+            other_mean, other_covariance = state.mean[i], state.covariance[i]
+            if merged:
+                merge(
+                    mean,
+                    covariance,
+                    share,
+                    mean,
+                    covariance,
+                    other_mean,
+                    other_covariance,
+                    work.states[0],
+                )
+            else:
+                merge(
+                    mean,
+                    covariance,
+                    share,
+                    state.mean[first],
+                    state.covariance[first],
+                    other_mean,
+                    other_covariance,
+                    work.states[0],
+                )
+            merged = True
             if errors:
                 for e in range(n_x):
-                    merge_mean(
-                        work.mixed_error[j, e], work.rows[2], share, state.residual_error[i, e]
-                    )
+                    error = work.mixed_error[j, e]
+                    merge_mean(error, work.rows[2], share, error, state.residual_error[i, e])
+        if not merged:
+            copy_all(mean, state.mean[first])
+            copy_all(covariance, state.covariance[first])
 
 
-@kernel
+@lane_kernel
 def predict(j, state, work, state_transition, input_effect, process_noise):
     """x <- F x + b, P <- F P F' + Q of mode j, from its mixed start."""
     n_x = state.mean.shape[1]
@@ -202,7 +230,7 @@ def predict(j, state, work, state_transition, input_effect, process_noise):
             apply(state.covariance[j, t], state_transition[c], rows, process_noise[t])
 
 
-@kernel
+@lane_kernel
 def weigh_modes(state, work, likelihoods, floor):
     """mu_j proportional to Lambda_j c_j (Hwang 2006, eq. 11), with no underflow.
 
@@ -235,7 +263,7 @@ def weigh_modes(state, work, likelihoods, floor):
                 state.log_mode_probabilities[j, b] = log(state.mode_probabilities[j, b])
 
 
-@kernel
+@lane_kernel
 def _normalise(out, logarithms, largest, total):
     """out_j <- exp(l_j)/sum_i exp(l_i); leaves max l and sum exp(l - max l) in the last two."""
     n_modes = logarithms.shape[0]
@@ -254,7 +282,7 @@ def _normalise(out, logarithms, largest, total):
             out[j, b] /= total[b]
 
 
-@kernel
+@lane_kernel
 def know_modes(state, known):
     """Mode probabilities of 1 and 0 for the mode that is known, lane by lane."""
     for j in range(state.mode_probabilities.shape[0]):
@@ -263,7 +291,7 @@ def know_modes(state, known):
             state.log_mode_probabilities[j, b] = 0.0 if known[b] == j else -np.inf
 
 
-@kernel
+@lane_kernel
 def combine(state, mean, covariance):
     """The estimate: the mean (n_x, lanes) of the mixture, and its covariance if wanted."""
     n_modes, n_x = state.mean.shape[:2]
@@ -288,7 +316,7 @@ def combine(state, mean, covariance):
                 t += 1
 
 
-@kernel
+@lane_kernel
 def advance(state, work, model, choices, measurements, known_modes, estimates):
     """Run the recursion over a span of scans; overwrites `state`, `work` and `estimates`.
 
@@ -392,13 +420,18 @@ def start(model: JumpMarkovModel, lanes: int, initial_mean: Array | None = None)
     probabilities = np.repeat(model.initial_mode_probabilities[:, np.newaxis], lanes, axis=1)
     with np.errstate(divide="ignore"):
         logarithms = np.log(probabilities)
-    return BankState(
-        mean=np.repeat(initial_mean[np.newaxis], n_modes, axis=0),
-        covariance=np.tile(packed[np.newaxis, :, np.newaxis], (n_modes, 1, lanes)),
-        mode_probabilities=probabilities,
-        log_mode_probabilities=logarithms,
-        residual_error=np.zeros((n_modes, n_x, lanes)),
+    state = BankState(
+        mean=aligned_zeros(n_modes, n_x, lanes),
+        covariance=aligned_zeros(n_modes, packed.size, lanes),
+        mode_probabilities=aligned_zeros(n_modes, lanes),
+        log_mode_probabilities=aligned_zeros(n_modes, lanes),
+        residual_error=aligned_zeros(n_modes, n_x, lanes),
     )
+    state.mean[:] = initial_mean
+    state.covariance[:] = packed[:, np.newaxis]
+    state.mode_probabilities[:] = probabilities
+    state.log_mode_probabilities[:] = logarithms
+    return state
 
 
 def workspace(model: JumpMarkovModel, lanes: int) -> Workspace:
@@ -406,15 +439,15 @@ def workspace(model: JumpMarkovModel, lanes: int) -> Workspace:
     n_modes, n_y, n_x = model.measurement_matrix.shape
     n_packed = n_x * (n_x + 1) // 2
     return Workspace(
-        mixed_mean=np.zeros((n_modes, n_x, lanes)),
-        mixed_covariance=np.zeros((n_modes, n_packed, lanes)),
-        mixed_error=np.zeros((n_modes, n_x, lanes)),
-        residual_mean=np.zeros((n_modes, n_y, lanes)),
-        predicted_probability=np.zeros((n_modes, lanes)),
-        log_predicted_probability=np.zeros((n_modes, lanes)),
-        log_likelihood=np.zeros((n_modes, lanes)),
-        states=np.zeros((3, n_x, lanes)),
-        rows=np.zeros((12, lanes)),
+        mixed_mean=aligned_zeros(n_modes, n_x, lanes),
+        mixed_covariance=aligned_zeros(n_modes, n_packed, lanes),
+        mixed_error=aligned_zeros(n_modes, n_x, lanes),
+        residual_mean=aligned_zeros(n_modes, n_y, lanes),
+        predicted_probability=aligned_zeros(n_modes, lanes),
+        log_predicted_probability=aligned_zeros(n_modes, lanes),
+        log_likelihood=aligned_zeros(n_modes, lanes),
+        states=aligned_zeros(3, n_x, lanes),
+        rows=aligned_zeros(12, lanes),
     )
 
 
@@ -426,10 +459,10 @@ def empty_estimates(
     n_modes = len(output_modes(model))
     likelihoods = likelihoods and n_modes == len(model.mode_names)
     return Estimates(
-        mean=np.empty((steps, n_x, lanes)),
-        mode_probabilities=np.empty((steps, n_modes, lanes)),
-        mode_likelihoods=np.empty((steps if likelihoods else 0, n_modes, lanes)),
-        covariance=np.empty((steps if covariance else 0, n_x * (n_x + 1) // 2, lanes)),
+        mean=aligned_zeros(steps, n_x, lanes),
+        mode_probabilities=aligned_zeros(steps, n_modes, lanes),
+        mode_likelihoods=aligned_zeros(steps if likelihoods else 0, n_modes, lanes),
+        covariance=aligned_zeros(steps if covariance else 0, n_x * (n_x + 1) // 2, lanes),
     )
 
 

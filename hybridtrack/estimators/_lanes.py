@@ -5,34 +5,55 @@ instructions. Covariances are packed lower triangles: element (a, c), a >= c, is
 a (a + 1)/2 + c.
 """
 
-from hybridtrack.compiled import kernel
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridtrack.compiled import lane_kernel, row_kernel
+
+CACHE_LINE_BYTES = 64
 
 
-@kernel
+def aligned_zeros(*shape: int) -> NDArray[np.float64]:
+    """Zeros at a cache line's beginning: vectors that straddle two lines cost a quarter more."""
+    size = math.prod(shape)
+    memory = np.zeros(size + CACHE_LINE_BYTES // 8)
+    first = -memory.ctypes.data % CACHE_LINE_BYTES // 8
+    return memory[first : first + size].reshape(shape)
+
+
+@row_kernel
 def set_scaled(out, factor, row):
     for b in range(out.size):
         out[b] = factor * row[b]
 
 
-@kernel
+@row_kernel
 def add_scaled(out, factor, row):
     for b in range(out.size):
         out[b] += factor * row[b]
 
 
-@kernel
+@row_kernel
 def copy(out, row):
     for b in range(out.size):
         out[b] = row[b]
 
 
-@kernel
+@lane_kernel
+def copy_all(out, rows):
+    for e in range(out.shape[0]):
+        copy(out[e], rows[e])
+
+
+@row_kernel
 def fill(out, value):
     for b in range(out.size):
         out[b] = value
 
 
-@kernel
+@lane_kernel
 def apply(out, matrix_row, vector, offset):
     """out <- matrix_row . vector + offset; structural zeros are skipped."""
     fill(out, offset)
@@ -41,7 +62,7 @@ def apply(out, matrix_row, vector, offset):
             add_scaled(out, matrix_row[e], vector[e])
 
 
-@kernel
+@row_kernel
 def packed(a, c):
     return a * (a + 1) // 2 + c if a >= c else c * (c + 1) // 2 + a
 
@@ -49,7 +70,7 @@ def packed(a, c):
 # ---- Gaussians merged one at a time ----------------------------------------------------------
 
 
-@kernel
+@row_kernel
 def merge_share(total, share, factor, row):
     """share <- factor row / (total + factor row), 0 where both are 0; total grows by it."""
     for b in range(total.size):
@@ -58,35 +79,44 @@ def merge_share(total, share, factor, row):
         share[b] = weight / total[b] if total[b] > 0.0 else 0.0
 
 
-@kernel
-def merge_mean(mean, difference, share, other):
-    for b in range(mean.size):
+@row_kernel
+def merge_mean(out, difference, share, mean, other):
+    for b in range(out.size):
         difference[b] = other[b] - mean[b]
-        mean[b] += share[b] * difference[b]
+        out[b] = mean[b] + share[b] * difference[b]
 
 
-@kernel
-def merge_second_moment(out, other, share, difference_a, difference_c):
+@row_kernel
+def merge_second_moment(out, one, other, share, difference_a, difference_c):
     for b in range(out.size):
         s = share[b]
         rest = 1.0 - s
-        out[b] = rest * (out[b] + s * (difference_a[b] * difference_c[b])) + s * other[b]
+        out[b] = rest * (one[b] + s * (difference_a[b] * difference_c[b])) + s * other[b]
 
 
-@kernel
-def merge(mean, covariance, share, other_mean, other_covariance, difference):
-    """Merge a second Gaussian into the first, with the given share of the sum of weights.
+@row_kernel
+def merge(
+    out_mean, out_covariance, share, mean, covariance, other_mean, other_covariance, difference
+):
+    """Merge two Gaussians, the other with the given share of the sum of weights.
+
+    The outcome may take the first one's place.
 
     P <- (1 - s) P + s P' + s (1 - s) d d', d the difference of the means: positive semidefinite
     in rounding too, since nothing is subtracted.
     """
     n_x = mean.shape[0]
     for e in range(n_x):
-        merge_mean(mean[e], difference[e], share, other_mean[e])
+        merge_mean(out_mean[e], difference[e], share, mean[e], other_mean[e])
     t = 0
     for a in range(n_x):
         for c in range(a + 1):
             merge_second_moment(
-                covariance[t], other_covariance[t], share, difference[a], difference[c]
+                out_covariance[t],
+                covariance[t],
+                other_covariance[t],
+                share,
+                difference[a],
+                difference[c],
             )
             t += 1

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from hybridtrack.compiled import kernel, log
+from hybridtrack.compiled import lane_kernel, log
 from hybridtrack.estimators._lanes import apply, copy, fill, set_scaled
 
 
-@kernel
+@lane_kernel
 def predict_residual(j, state, work, model, state_transition, input_effect):
     """RMIMM's mean residual of filter j (Hwang 2006, eq. 28), the true mode marginalised.
 
@@ -39,7 +39,7 @@ def predict_residual(j, state, work, model, state_transition, input_effect):
                 residual[m, b] += weight[b] * row[b]
 
 
-@kernel
+@lane_kernel
 def divide_by_residual_mean(work, y, common, floor):
     """RMIMM's factor N_j = 1/max(||rbar_j||, floor) on each likelihood (Hwang 2006, eq. 29).
 

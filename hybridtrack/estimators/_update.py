@@ -8,25 +8,28 @@ P_aa >= K_a R K_a.
 
 import numpy as np
 
-from hybridtrack.compiled import kernel, log
+from hybridtrack.compiled import lane_kernel, log
 from hybridtrack.estimators._lanes import add_scaled, apply, fill, packed, set_scaled
 
 
-@kernel
+@lane_kernel
 def _innovate(y, mean, coefficient, variance, position_variance, out, inverse, squared, scale):
     """Innovation of a scalar measurement; where it is missing, an update of no effect."""
+    # One loop each: with many rows in one loop the compiler gives up proving them apart.
     for b in range(y.size):
-        detected = y[b] == y[b]
         known = 0.0 if position_variance[b] < 0.0 else position_variance[b]  # NaN stays NaN
         s = coefficient * coefficient * known + variance
-        innovation = y[b] - coefficient * mean[b] if detected else 0.0
-        inverse[b] = 1.0 / s if detected else 0.0
-        out[b] = innovation
-        squared[b] += innovation * innovation * inverse[b]
-        scale[b] *= s if detected else 1.0
+        inverse[b] = 1.0 / s if y[b] == y[b] else 0.0
+    for b in range(y.size):
+        known = 0.0 if position_variance[b] < 0.0 else position_variance[b]
+        scale[b] *= coefficient * coefficient * known + variance if y[b] == y[b] else 1.0
+    for b in range(y.size):
+        out[b] = y[b] - coefficient * mean[b] if y[b] == y[b] else 0.0
+    for b in range(y.size):
+        squared[b] += out[b] * out[b] * inverse[b]
 
 
-@kernel
+@lane_kernel
 def _bound_variances(covariance, gains, variance):
     """P_aa >= r K_a^2, the share of the measurement's own noise in the estimate."""
     for a in range(gains.shape[0]):
@@ -36,7 +39,7 @@ def _bound_variances(covariance, gains, variance):
             row[b] = least if row[b] < least else row[b]
 
 
-@kernel
+@lane_kernel
 def _update_by_component(
     mean, covariance, component, coefficient, variance, y, squared, scale, work
 ):
@@ -46,8 +49,8 @@ def _update_by_component(
     half its cost; elsewhere his correction is no larger than the rounding of P itself.
     """
     n_x = mean.shape[0]
-    innovation, inverse, gain = work.rows[3], work.rows[4], work.rows[5]
-    rows = work.states[1]
+    innovation, inverse, kept = work.rows[3], work.rows[4], work.rows[5]
+    gains, rows = work.states[1], work.states[2]
     p = component
     _innovate(
         y,
@@ -60,35 +63,26 @@ def _update_by_component(
         squared,
         scale,
     )
+    for b in range(innovation.size):
+        kept[b] = variance * inverse[b] if inverse[b] != 0.0 else 1.0
     for e in range(n_x):
-        source = covariance[packed(e, p)]
-        row = rows[e]
+        measured, row, gain = covariance[packed(e, p)], rows[e], gains[e]
         for b in range(innovation.size):
-            row[b] = coefficient * source[b]
+            row[b] = coefficient * measured[b]
+            measured[b] *= kept[b]
+        for b in range(innovation.size):
+            gain[b] = row[b] * inverse[b]
             mean[e, b] += row[b] * inverse[b] * innovation[b]
     for a in range(n_x):
-        if a == p:
-            continue
-        for b in range(innovation.size):
-            gain[b] = rows[a, b] * inverse[b]
         for c in range(a + 1):
-            if c != p:
-                out, other = covariance[packed(a, c)], rows[c]
+            if a != p and c != p:
+                out, gain, row = covariance[packed(a, c)], gains[a], rows[c]
                 for b in range(innovation.size):
-                    out[b] -= gain[b] * other[b]
-    for b in range(innovation.size):
-        gain[b] = variance * inverse[b] if inverse[b] != 0.0 else 1.0
-    for e in range(n_x):
-        out = covariance[packed(e, p)]
-        for b in range(innovation.size):
-            out[b] *= gain[b]
-    for e in range(n_x):  # the rows become the gain, for whoever needs it afterwards
-        for b in range(innovation.size):
-            rows[e, b] *= inverse[b]
-    _bound_variances(covariance, rows, variance)
+                    out[b] -= gain[b] * row[b]
+    _bound_variances(covariance, gains, variance)
 
 
-@kernel
+@lane_kernel
 def _update_by_combination(mean, covariance, h, variance, y, squared, scale, work):
     """Update by a scalar measurement h' x + noise: Joseph's form for one measurement.
 
@@ -132,7 +126,7 @@ def _update_by_combination(mean, covariance, h, variance, y, squared, scale, wor
     _bound_variances(covariance, gains, variance)
 
 
-@kernel
+@lane_kernel
 def update(j, state, work, model, y, errors):
     """Kalman update of mode j by the scan y (n_y, lanes), one decorrelated component at a time.
 
@@ -152,8 +146,9 @@ def update(j, state, work, model, y, errors):
         apply(measured, model.decorrelation[j, m], y, 0.0)
         # A scan with a missing component is missing as a whole.
         for other in range(n_y):
-            for b in range(measured.size):
-                measured[b] = measured[b] if y[other, b] == y[other, b] else np.nan
+            if other != m:
+                for b in range(measured.size):
+                    measured[b] = measured[b] if y[other, b] == y[other, b] else np.nan
         h, variance = model.decorrelated_matrix[j, m], model.decorrelated_variance[j, m]
         components = 0
         component = 0
