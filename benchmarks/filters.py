@@ -19,8 +19,9 @@ import numpy as np
 from problem import Array, Problem
 
 from hybridtrack.blocks import SPAN_STEPS
-from hybridtrack.estimators import _bank, estimators
+from hybridtrack.estimators import Estimates, _bank, _layout, estimators
 from hybridtrack.simulation import BLOCK_RUNS, spans
+from hybridtrack.vectors import WIDTH
 
 Filter = Callable[[bool], tuple[Array, Array] | None]
 Competitor = Callable[[Problem], Filter]
@@ -35,6 +36,7 @@ def available() -> dict[str, Competitor]:
     if shutil.which(CXX):
         found["C++, textbook"] = functools.partial(cpp, algebra="textbook")
         found["C++, ours"] = functools.partial(cpp, algebra="ours")
+        found["C++, 256 lanes"] = functools.partial(cpp, algebra="textbook", lanes=BLOCK_RUNS)
     if find_spec("jax"):
         found["JAX"] = with_jax
     found["NumPy, batched"] = batched
@@ -60,7 +62,7 @@ def one_bank(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
 
 # ---- blocks of lanes, spans of steps: ours and C++ -------------------------------------------
 
-Advance = Callable[[Array, _bank.Estimates], None]  # a span's measurements, room for estimates
+Advance = Callable[[Array, Estimates], None]  # a span's measurements, room for estimates
 
 
 def _in_blocks(problem: Problem, start: Callable[[], Advance]) -> Filter:
@@ -71,7 +73,7 @@ def _in_blocks(problem: Problem, start: Callable[[], Advance]) -> Filter:
         np.ascontiguousarray(problem.measurements[..., first : first + BLOCK_RUNS])
         for first in range(0, runs, BLOCK_RUNS)
     ]
-    room = _bank.empty_estimates(
+    room = _layout.empty_estimates(
         problem.model, SPAN_STEPS, BLOCK_RUNS, likelihoods=False, covariance=False
     )
 
@@ -103,15 +105,15 @@ def _joined(parts: list[Array], steps: int) -> Array:
 def ours(problem: Problem) -> Filter:
     """The compiled recursion through the function that the product calls."""
     model = problem.model
-    kernel_model = _bank.kernel_model(model)
+    kernel_model = _layout.kernel_model(model)
     imm = estimators()["imm"]
     recursion = imm.recursion(imm.settings())
-    work = _bank.workspace(model, BLOCK_RUNS)
+    work = _layout.workspace(model)
 
     def start() -> Advance:
-        state = _bank.start(model, BLOCK_RUNS)
+        state = _layout.start(model, BLOCK_RUNS)
 
-        def advance(z: Array, room: _bank.Estimates) -> None:
+        def advance(z: Array, room: Estimates) -> None:
             _bank.run_span(state, work, kernel_model, recursion, z, room)
 
         return advance
@@ -119,8 +121,8 @@ def ours(problem: Problem) -> Filter:
     return _in_blocks(problem, start)
 
 
-def cpp(problem: Problem, algebra: str) -> Filter:
-    """imm.cpp, written for this size; algebra: textbook or ours."""
+def cpp(problem: Problem, algebra: str, lanes: int = WIDTH) -> Filter:
+    """imm.cpp, written for this size; algebra: textbook or ours; lanes at a time."""
     F, Q, H, R, transition = one_bank(problem)
     n_modes, n_y, n_x = H.shape
     lower = np.tril_indices(n_x)
@@ -128,20 +130,27 @@ def cpp(problem: Problem, algebra: str) -> Filter:
     assert not F[~in_pattern].any(), "imm.cpp takes other elements of F for zeros"
     assert (np.eye(n_x)[::3] == H).all(), "imm.cpp measures positions"
     assert (R[0] * np.eye(n_y) == R).all(), "imm.cpp takes uncorrelated measurements"
-    variance = np.diagonal(R[0])
+    model = problem.model
     packed_model = np.concatenate(
-        [part.ravel() for part in (F, Q[:, lower[0], lower[1]], variance, transition)]
+        [part.ravel() for part in (F, Q[:, *lower], np.diagonal(R[0]), transition)]
     )
-    mixed = _aligned(n_modes * (n_x + len(lower[0]) + 3) * BLOCK_RUNS)
-    function = getattr(_library(), f"advance_{algebra}_{n_x}_{n_y}")
+    start_of_a_lane = np.concatenate(
+        [
+            *n_modes * [model.initial_mean],
+            *n_modes * [model.initial_covariance[lower]],
+            model.initial_mode_probabilities,
+        ]
+    )
+    group = np.repeat(start_of_a_lane, lanes)
+    mixed = _layout.aligned_zeros(n_modes * (n_x + len(lower[0]) + 3) * lanes)
+    function = getattr(_library(lanes), f"advance_{algebra}_{n_x}_{n_y}")
     function.restype = None
 
     def start() -> Advance:
-        given = _bank.start(problem.model, BLOCK_RUNS)
-        state = _aligned(n_modes * (n_x + len(lower[0]) + 2) * BLOCK_RUNS)
-        state[:] = np.concatenate([part.ravel() for part in given[:4]])
+        state = _layout.aligned_zeros(BLOCK_RUNS // lanes, group.size)
+        state[:] = group
 
-        def advance(z: Array, room: _bank.Estimates) -> None:
+        def advance(z: Array, room: Estimates) -> None:
             arrays = (state, mixed, packed_model, z, room.mean, room.mode_probabilities)
             function(ctypes.c_int(len(z)), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
 
@@ -156,19 +165,14 @@ def _cpp_pattern(n_modes: int, n_x: int) -> Any:
     return (a // 3 == e // 3) & (e >= a) & ~((mode == 0) & (e % 3 == 2))
 
 
-def _aligned(size: int) -> Array:
-    """float64 at a cache line's beginning."""
-    memory = np.empty(size + 8)
-    return memory[(-memory.ctypes.data % 64) // 8 :][:size]
-
-
 @functools.cache
-def _library() -> ctypes.CDLL:
+def _library(lanes: int) -> ctypes.CDLL:
     """imm.cpp compiled for this machine."""
     with tempfile.TemporaryDirectory() as folder:
         library, compiled = Path(folder) / "imm.so", Path(folder) / "imm.o"
         source = Path(__file__).with_name("imm.cpp")
-        subprocess.run([CXX, *CXX_FLAGS, "-c", str(source), "-o", str(compiled)], check=True)
+        flags = [*CXX_FLAGS, f"-DLANES={lanes}"]
+        subprocess.run([CXX, *flags, "-c", str(source), "-o", str(compiled)], check=True)
         # Linked with -ffast-math it would flush subnormals to zero in this whole process.
         subprocess.run([CXX, "-shared", str(compiled), "-o", str(library)], check=True)
         return ctypes.CDLL(str(library))

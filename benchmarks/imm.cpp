@@ -1,12 +1,13 @@
 // The practical limit: the IMM with two modes, hand-written for one size, lanes last.
 //
-// A lane is a run; an array's last axis has LANES of them, and every inner loop goes over it. Sizes
-// and the structural zeros of F and H are known when this is compiled. Two algebras:
+// A lane is a run; every inner loop goes over LANES of them, one group of the BLOCK after the other,
+// so that a group's state stays in the first-level cache over all steps of a span. Sizes and the
+// structural zeros of F and H are known when this is compiled. Two algebras:
 //
 //   textbook  mixing by sums of P_i + d d', F P F' + Q, Joseph's form, exp and log of the C library
-//   ours      that of hybridtrack/estimators/_bank.py: Gaussians merged in pairs, measured rows
-//             scaled by r/s one measurement at a time, polynomial exp and log, logarithms of the
-//             mode probabilities kept
+//   ours      that of hybridtrack/estimators/_bank.py: Gaussians merged in pairs, F P F' as one
+//             sparse product, measured rows scaled by r/s one measurement at a time, modes weighed
+//             by sqrt(1/S) with a polynomial exp and no logarithm
 //
 // Both work on packed lower triangles. Missing measurements are left out (-ffast-math has no NaN).
 // States are (position, velocity, acceleration) per axis, positions are measured; the first mode
@@ -20,7 +21,7 @@
 
 namespace {
 
-constexpr int LANES = 256;
+constexpr int BLOCK = 256;
 constexpr int MODES = 2;
 using Row = double[LANES];
 
@@ -62,7 +63,6 @@ struct State {
     Row mean[MODES][NX];
     Row covariance[MODES][NP];
     Row probability[MODES];
-    Row log_probability[MODES];
 };
 
 template <int NX>
@@ -70,11 +70,26 @@ struct Mixed {
     Row mean[MODES][NX];
     Row covariance[MODES][NX * (NX + 1) / 2];
     Row predicted[MODES];
-    Row log_predicted[MODES];
-    Row log_likelihood[MODES];
+    Row density[MODES];
+    Row exponent[MODES];
 };
 
 // ---- what both share -----------------------------------------------------------------------
+
+template <int NX>
+void combine(const State<NX>& state, double* __restrict mean, double* __restrict probability) {
+    for (int e = 0; e < NX; e++)
+#pragma GCC ivdep
+        for (int b = 0; b < LANES; b++)
+            mean[e * BLOCK + b] = state.probability[0][b] * state.mean[0][e][b] +
+                                  state.probability[1][b] * state.mean[1][e][b];
+    for (int j = 0; j < MODES; j++)
+        std::memcpy(probability + j * BLOCK, state.probability[j], sizeof(Row));
+}
+
+// ---- textbook ------------------------------------------------------------------------------
+
+namespace textbook {
 
 // x <- F x, P <- F P F' + Q from the mixed start of mode J
 template <int J, int NX, int NY>
@@ -111,20 +126,6 @@ void predict(State<NX>& state, const Mixed<NX>& mixed, const Model<NX, NY>& mode
         }
     });
 }
-
-template <int NX>
-void combine(const State<NX>& state, double* __restrict mean, double* __restrict probability) {
-    for (int e = 0; e < NX; e++)
-#pragma GCC ivdep
-        for (int b = 0; b < LANES; b++)
-            mean[e * LANES + b] = state.probability[0][b] * state.mean[0][e][b] +
-                                  state.probability[1][b] * state.mean[1][e][b];
-    std::memcpy(probability, state.probability, sizeof state.probability);
-}
-
-// ---- textbook ------------------------------------------------------------------------------
-
-namespace textbook {
 
 template <int NX, int NY>
 void mix(const State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model) {
@@ -171,7 +172,7 @@ void update(State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model,
 #pragma GCC ivdep
     for (int b = 0; b < LANES; b++) {
         double K[NX][NY], innovation[NY], inverse[NY][NY];
-        each<NY>([&](auto m) { innovation[m] = y[m * LANES + b] - state.mean[J][3 * m][b]; });
+        each<NY>([&](auto m) { innovation[m] = y[m * BLOCK + b] - state.mean[J][3 * m][b]; });
         if constexpr (NY == 1) {
             const double s = P[0][b] + model.R[0];
             determinant[b] = s;
@@ -221,14 +222,14 @@ void update(State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model,
     }
 #pragma GCC ivdep
     for (int b = 0; b < LANES; b++)
-        mixed.log_likelihood[J][b] = -0.5 * (squared[b] + std::log(determinant[b]));
+        mixed.exponent[J][b] = -0.5 * (squared[b] + std::log(determinant[b]));
 }
 
 template <int NX>
 void weigh(State<NX>& state, const Mixed<NX>& mixed) {
 #pragma GCC ivdep
     for (int b = 0; b < LANES; b++) {
-        const double l0 = mixed.log_likelihood[0][b], l1 = mixed.log_likelihood[1][b];
+        const double l0 = mixed.exponent[0][b], l1 = mixed.exponent[1][b];
         const double largest = l0 > l1 ? l0 : l1;
         const double w0 = mixed.predicted[0][b] * std::exp(l0 - largest);
         const double w1 = mixed.predicted[1][b] * std::exp(l1 - largest);
@@ -258,11 +259,6 @@ inline double bits(std::int64_t i) {
     std::memcpy(&x, &i, 8);
     return x;
 }
-inline std::int64_t bits(double x) {
-    std::int64_t i;
-    std::memcpy(&i, &x, 8);
-    return i;
-}
 
 // As hybridtrack/compiled.py has them. -ffast-math may not undo the reduction: n is an integer.
 inline double exp(double x) {
@@ -278,18 +274,6 @@ inline double exp(double x) {
     return x <= -708.0 ? 0.0 : p * bits(exponent << 52);
 }
 
-inline double log(double x) {
-    const std::int64_t shifted = bits(x) - 0x3FE6A09E667F3BCD;
-    const double m = bits((shifted & 0xFFFFFFFFFFFFF) + 0x3FE6A09E667F3BCD);
-    const double n = static_cast<double>(shifted >> 52);
-    const double f = (m - 1.0) / (m + 1.0), g = f * f;
-    double p = 1.0 / 21.0;
-    constexpr double coefficients[] = {1.0 / 19.0, 1.0 / 17.0, 1.0 / 15.0, 1.0 / 13.0, 1.0 / 11.0,
-                                       1.0 / 9.0,  1.0 / 7.0,  1.0 / 5.0,  1.0 / 3.0};
-    each<9>([&](auto i) { p = p * g + coefficients[i]; });
-    return n * 0.693147180369123816490 + (n * 1.90821492927058770002e-10 + 2.0 * (f * g * p + f));
-}
-
 template <int NX, int NY>
 void mix(const State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model) {
     each<MODES>([&](auto j) {
@@ -301,7 +285,6 @@ void mix(const State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model) {
             const double total = p0 * state.probability[0][b] + w1;
             mixed.predicted[j][b] = total;
             share[b] = total > 0.0 ? w1 / total : 0.0;
-            mixed.log_predicted[j][b] = log(total);
         }
 #pragma GCC ivdep
         for (int b = 0; b < LANES; b++) {
@@ -323,21 +306,63 @@ void mix(const State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model) {
     });
 }
 
+// Whether P(e, g) takes part in (F P F')(a, c), e >= g
+constexpr bool contributes(int mode, int a, int c, int e, int g) {
+    return (moves(mode, a, e) && moves(mode, c, g)) || (moves(mode, a, g) && moves(mode, c, e));
+}
+
+// x <- F x, P <- F P F' + Q, each element of P in one sparse sum
+template <int J, int NX, int NY>
+void predict(State<NX>& state, const Mixed<NX>& mixed, const Model<NX, NY>& model) {
+    auto& F = model.F[J];
+#pragma GCC ivdep
+    for (int b = 0; b < LANES; b++) {
+        each<NX>([&](auto a) {
+            double x = 0.0;
+            each<NX>([&](auto e) {
+                if constexpr (moves(J, a, e)) x += F[a][e] * mixed.mean[J][e][b];
+            });
+            state.mean[J][a][b] = x;
+        });
+    }
+    each<NX>([&](auto a) {
+        each<a + 1>([&](auto c) {
+            double weight[NX][NX];
+            each<NX>([&](auto e) {
+                each<e + 1>([&](auto g) {
+                    weight[e][g] = F[a][e] * F[c][g] + (e != g ? F[a][g] * F[c][e] : 0.0);
+                });
+            });
+#pragma GCC ivdep
+            for (int b = 0; b < LANES; b++) {
+                double p = model.Q[J][packed(a, c)];
+                each<NX>([&](auto e) {
+                    each<e + 1>([&](auto g) {
+                        if constexpr (contributes(J, a, c, e, g))
+                            p += weight[e][g] * mixed.covariance[J][packed(e, g)][b];
+                    });
+                });
+                state.covariance[J][packed(a, c)][b] = p;
+            }
+        });
+    });
+}
+
 template <int J, int NX, int NY>
 void update(State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model,
             const double* __restrict y) {
     auto& P = state.covariance[J];
-    Row squared, scale;
+    Row squared, precision;
     each<NY>([&](auto m) {
         constexpr int p = 3 * m;
         const double variance = model.R[m];
 #pragma GCC ivdep
         for (int b = 0; b < LANES; b++) {
-            const double s = P[packed(p, p)][b] + variance, inverse = 1.0 / s;
-            const double innovation = y[m * LANES + b] - state.mean[J][p][b];
+            const double inverse = 1.0 / (P[packed(p, p)][b] + variance);
+            const double innovation = y[m * BLOCK + b] - state.mean[J][p][b];
             const double d2 = innovation * innovation * inverse;
             squared[b] = m == 0 ? d2 : squared[b] + d2;
-            scale[b] = m == 0 ? s : scale[b] * s;
+            precision[b] = m == 0 ? inverse : precision[b] * inverse;
             double row[NX];
             each<NX>([&](auto e) {
                 row[e] = P[packed(e, p)][b];
@@ -355,23 +380,23 @@ void update(State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model,
         }
     });
 #pragma GCC ivdep
-    for (int b = 0; b < LANES; b++)
-        mixed.log_likelihood[J][b] = -0.5 * (squared[b] + log(scale[b]));
+    for (int b = 0; b < LANES; b++) {
+        mixed.density[J][b] = std::sqrt(precision[b]);
+        mixed.exponent[J][b] = -0.5 * squared[b];
+    }
 }
 
 template <int NX>
 void weigh(State<NX>& state, const Mixed<NX>& mixed) {
 #pragma GCC ivdep
     for (int b = 0; b < LANES; b++) {
-        const double l0 = mixed.log_likelihood[0][b] + mixed.log_predicted[0][b];
-        const double l1 = mixed.log_likelihood[1][b] + mixed.log_predicted[1][b];
+        const double l0 = mixed.exponent[0][b], l1 = mixed.exponent[1][b];
         const double largest = l0 > l1 ? l0 : l1;
-        const double w0 = exp(l0 - largest), w1 = exp(l1 - largest);
-        const double total = w0 + w1, all = largest + log(total);
-        state.probability[0][b] = w0 / total;
-        state.probability[1][b] = w1 / total;
-        state.log_probability[0][b] = l0 - all;
-        state.log_probability[1][b] = l1 - all;
+        const double w0 = mixed.density[0][b] * mixed.predicted[0][b] * exp(l0 - largest);
+        const double w1 = mixed.density[1][b] * mixed.predicted[1][b] * exp(l1 - largest);
+        const double inverse = 1.0 / (w0 + w1);
+        state.probability[0][b] = w0 * inverse;
+        state.probability[1][b] = w1 * inverse;
     }
 }
 
@@ -389,17 +414,21 @@ void step(State<NX>& state, Mixed<NX>& mixed, const Model<NX, NY>& model, const 
 
 }  // namespace
 
-// Several steps: y (n_steps, NY, LANES); mean (n_steps, NX, LANES), probability (n_steps, 2, LANES).
+// Several steps, one group of lanes after the other: y (n_steps, NY, BLOCK); mean (n_steps, NX,
+// BLOCK), probability (n_steps, 2, BLOCK).
 #define ADVANCE(ALGEBRA, NX, NY)                                                               \
     extern "C" void advance_##ALGEBRA##_##NX##_##NY(                                           \
-        int n_steps, void* state, void* mixed, const void* model, const double* y,             \
+        int n_steps, void* states, void* mixed, const void* model, const double* y,            \
         double* mean, double* probability) {                                                   \
-        auto& s = *static_cast<State<NX>*>(state);                                             \
-        for (int k = 0; k < n_steps; k++) {                                                    \
-            ALGEBRA::step<NX, NY>(s, *static_cast<Mixed<NX>*>(mixed),                          \
-                                  *static_cast<const Model<NX, NY>*>(model),                   \
-                                  y + k * NY * LANES);                                         \
-            combine(s, mean + k * NX * LANES, probability + k * MODES * LANES);                \
+        for (int g = 0; g < BLOCK / LANES; g++) {                                              \
+            auto& s = static_cast<State<NX>*>(states)[g];                                      \
+            for (int k = 0; k < n_steps; k++) {                                                \
+                ALGEBRA::step<NX, NY>(s, *static_cast<Mixed<NX>*>(mixed),                      \
+                                      *static_cast<const Model<NX, NY>*>(model),               \
+                                      y + k * NY * BLOCK + g * LANES);                         \
+                combine(s, mean + k * NX * BLOCK + g * LANES,                                  \
+                        probability + k * MODES * BLOCK + g * LANES);                          \
+            }                                                                                  \
         }                                                                                      \
     }
 

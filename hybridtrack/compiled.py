@@ -7,7 +7,6 @@ not see an edit in another file (numba issue 1833), a new folder does.
 
 import functools
 import hashlib
-import math
 import os
 import stat
 import tempfile
@@ -21,6 +20,7 @@ PACKAGE = Path(__file__).parent
 # the flags that assume there are none (nnan, ninf) are left off.
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 EXACT = {"contract"}
+UNCOUNTED: dict[str, Any] = {"error_model": "numpy", "_nrt": False}
 KERNELS_MIB = 8  # 3 to 6 as compiled today
 
 
@@ -78,11 +78,13 @@ def _require_room(folder: Path) -> None:
 if "NUMBA_CACHE_DIR" not in os.environ:
     os.environ["NUMBA_CACHE_DIR"] = str(_cache_folder())
 
+import llvmlite.binding  # noqa: E402
 import numba  # noqa: E402  (the cache folder must be known before)
-from numba import types  # noqa: E402
-from numba.extending import intrinsic  # noqa: E402
 
 numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
+# Loops over a few states, unrolled fourfold with a remainder, make the recursion's code too long
+# for the cache of instructions, and a third slower.
+llvmlite.binding.set_option("", "-unroll-runtime=false")
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -95,116 +97,19 @@ def lane_kernel(function: Callable[..., Any]) -> Any:
 
     Every view of a row would count one up and down again: a third of the recursion's time.
     """
-    options: dict[str, Any] = {"fastmath": FAST, "error_model": "numpy", "_nrt": False}
-    return numba.njit(function, cache=True, nogil=True, **options)
+    return numba.njit(function, cache=True, nogil=True, fastmath=FAST, **UNCOUNTED)
 
 
 def row_kernel(function: Callable[..., Any]) -> Any:
-    """A lane kernel of a few lines, put in its caller's place."""
-    options: dict[str, Any] = {"fastmath": FAST, "error_model": "numpy", "_nrt": False}
-    return numba.njit(function, cache=True, nogil=True, forceinline=True, **options)
+    """A part of a lane kernel, put in its caller's place: a call has a hundred arguments."""
+    return numba.njit(function, cache=True, forceinline=True, fastmath=FAST, **UNCOUNTED)
 
 
-def exact_kernel(function: Callable[..., Any]) -> Any:
+def exact_row_kernel(function: Callable[..., Any]) -> Any:
     """The same without reassociation: for code that counts on the order of its operations."""
-    return numba.njit(function, cache=True, nogil=True, fastmath=EXACT, error_model="numpy")
+    return numba.njit(function, cache=True, forceinline=True, fastmath=EXACT, **UNCOUNTED)
 
 
 def kernels_are_cached() -> bool:
     """Whether this version's kernels were compiled before (the first use takes a while)."""
     return any(Path(numba.config.CACHE_DIR).rglob("_bank.advance-*.nbi"))
-
-
-@intrinsic
-def _float_bits(typing_context: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], context.get_value_type(types.int64))
-
-    return types.int64(types.float64), generate
-
-
-@intrinsic
-def _bits_float(typing_context: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], context.get_value_type(types.float64))
-
-    return types.float64(types.int64), generate
-
-
-LOG2_E = 1.4426950408889634
-LN2_HIGH = 0.693147180369123816490  # the upper 32 bits of ln 2, and the rest (fdlibm)
-LN2_LOW = 1.90821492927058770002e-10
-SQRT_HALF_BITS = 0x3FE6A09E667F3BCD
-
-
-def _exp(x: float) -> float:
-    """e**x for x <= 0 (larger x up to 700 too); below -708, where subnormals begin, 0.
-
-    Cody-Waite reduction to |r| <= ln(2)/2 and the Taylor polynomial of degree 13, whose remainder
-    there is below 1e-17. Branch-free, so that a loop over lanes becomes vector instructions:
-    the C library's exp does not.
-    """
-    y = -708.0 if x <= -708.0 else x  # NaN stays NaN
-    n = np_rint(y * LOG2_E)
-    r = (y - n * LN2_HIGH) - n * LN2_LOW
-    p = 1.0 / 6227020800.0
-    p = p * r + 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
-    # Adding 1.5 * 2**52 leaves n as an integer in the low bits; shifted, it is the exponent of 2.
-    scale = _bits_float((_float_bits(n + 6755399441055744.0) + 1023) << 52)
-    value = p * scale
-    return value if not x <= -708.0 else 0.0
-
-
-def _log(x: float) -> float:
-    """Natural logarithm for finite x >= 0 (log 0 = -inf), to about one unit in the last place.
-
-    log(m) = 2 atanh((m - 1)/(m + 1)) for the mantissa in [sqrt(1/2), sqrt(2)); the series'
-    remainder after eleven terms is below 1e-17. Branch-free like `exp`.
-    """
-    tiny = x < 2.2250738585072014e-308
-    y = x * 18014398509481984.0 if tiny else x  # 2**54 brings subnormals up
-    bits = _float_bits(y) - SQRT_HALF_BITS
-    exponent = bits >> 52
-    m = _bits_float((bits & 0xFFFFFFFFFFFFF) + SQRT_HALF_BITS)
-    n = float(exponent) - (54.0 if tiny else 0.0)
-    f = (m - 1.0) / (m + 1.0)
-    g = f * f
-    p = 1.0 / 21.0
-    p = p * g + 1.0 / 19.0
-    p = p * g + 1.0 / 17.0
-    p = p * g + 1.0 / 15.0
-    p = p * g + 1.0 / 13.0
-    p = p * g + 1.0 / 11.0
-    p = p * g + 1.0 / 9.0
-    p = p * g + 1.0 / 7.0
-    p = p * g + 1.0 / 5.0
-    p = p * g + 1.0 / 3.0
-    value = n * LN2_HIGH + (n * LN2_LOW + 2.0 * (f * g * p + f))
-    return value if x > 0.0 else (-math.inf if x == 0.0 else math.nan)
-
-
-if numba.config.DISABLE_JIT:  # tests of small cases, line by line in Python
-
-    def exp(x: float) -> float:
-        return math.exp(x) if x > -708.0 or x != x else 0.0
-
-    def log(x: float) -> float:
-        return math.log(x) if x > 0.0 else (-math.inf if x == 0.0 else math.nan)
-else:
-    import numpy as np
-
-    np_rint = np.rint
-    exp = exact_kernel(_exp)
-    log = exact_kernel(_log)

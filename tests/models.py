@@ -3,8 +3,9 @@
 import numpy as np
 
 from hybridtrack.config import load
-from hybridtrack.estimators import _bank
+from hybridtrack.estimators import Estimates, _bank, _layout
 from hybridtrack.models import JumpMarkovModel, Mode, ModeBank
+from hybridtrack.vectors import WIDTH
 
 
 def figure_5_model(dimensions=2):
@@ -59,28 +60,33 @@ def slice_times(model, steps):
 
 
 def run_kernel(model, z, recursion=None, spans=None, known=None, initial_mean=None):
-    """Filter z (steps, n_y, lanes); returns Estimates (with everything) and the last state."""
+    """Filter z (steps, n_y, lanes); returns Estimates (with everything) and the last state.
+
+    The state has (n_groups, ..., WIDTH); lanes that fill the last group up are copies of the last.
+    """
     steps, _, lanes = z.shape
-    state = _bank.start(model, lanes, initial_mean)
-    work = _bank.workspace(model, lanes)
-    spans = spans or [slice(0, steps)]
+    last = [*range(lanes), *[lanes - 1] * (-lanes % WIDTH)]
+    z = z[..., last]
+    initial_mean = None if initial_mean is None else initial_mean[..., last]
+    known = _bank.NO_KNOWN_MODES if known is None else known[..., last].astype(float)
+    state = _layout.start(model, len(last), initial_mean)
+    work = _layout.workspace(model)
     parts = []
-    for span in spans:
+    for span in spans or [slice(0, steps)]:
         part = slice_times(model, span)
         n = len(z[span])
-        out = _bank.empty_estimates(part, n, lanes, likelihoods=True, covariance=True)
-        known_modes = _bank.NO_KNOWN_MODES if known is None else known[span]
+        out = _layout.empty_estimates(part, n, len(last), likelihoods=True, covariance=True)
         _bank.run_span(
             state,
             work,
-            _bank.kernel_model(part),
+            _layout.kernel_model(part),
             recursion or _bank.Recursion(),
             np.ascontiguousarray(z[span]),
             out,
-            known_modes,
+            np.ascontiguousarray(known[span]),
         )
-        parts.append(out)
-    return _bank.Estimates(*(np.concatenate(p) for p in zip(*parts, strict=True))), state
+        parts.append(Estimates(*(array[..., :lanes] for array in out)))
+    return Estimates(*(np.concatenate(p) for p in zip(*parts, strict=True))), state
 
 
 def unpacked(covariance, n_x):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference
-from hybridtrack.estimators import _bank
+from hybridtrack.estimators import _bank, _layout
 from hybridtrack.estimators._bank import (
     COMMON_RESIDUAL_MEAN,
     INHERIT,
@@ -17,6 +17,7 @@ from hybridtrack.estimators._bank import (
     RESIDUAL_MEAN,
     Recursion,
 )
+from hybridtrack.vectors import WIDTH
 from models import figure_5_model, random_model, run_kernel, unpacked
 
 ROUNDING = 1e-10  # relative: about 1e-16 per operation, some 1e4 operations, a margin of 100
@@ -127,7 +128,7 @@ def test_supermodes_of_one_name_are_reported_as_one(name):
     # Rounding of one sum.
     np.testing.assert_allclose(named.mode_probabilities, expected, rtol=0, atol=1e-15)
     assert named.mean.tobytes() == apart.mean.tobytes()
-    assert state.mode_probabilities.shape == (3, 3)  # inside they stay apart
+    assert state.mode_probabilities.shape == (1, 3, WIDTH)  # inside they stay apart
     assert named.mode_likelihoods.size == 0  # a likelihood of several modes together is none
 
 
@@ -255,24 +256,30 @@ def scalar_model(F, P0=(1.0, 1.0), means=(0.0, 10.0), matrix=((0.9, 0.1), (0.1, 
 def test_hand_case_of_one_step():
     """Means 0 and 10 of variance 1; a missing scan leaves the prediction to be seen."""
     model = scalar_model((1.0, 2.0))
-    state = _bank.start(model, 1)
-    state.mean[:, 0, 0] = 0.0, 10.0
-    work = _bank.workspace(model, 1)
+    state = _layout.start(model, WIDTH)
+    state.mean[:, :, 0] = [[0.0], [10.0]]
     # Equal probabilities and .9/.1: the modes' starts are 1 and 9, of variance 1 + .09 * 100.
-    state.mode_probabilities[:, 0] = 0.5
-    state.log_mode_probabilities[:, 0] = np.log(0.5)
-    out = _bank.empty_estimates(model, 1, 1, likelihoods=True, covariance=True)
-    z = np.full((1, 1, 1), np.nan)
-    _bank.run_span(state, work, _bank.kernel_model(model), Recursion(), z, out)
-    np.testing.assert_allclose(state.mean[:, 0, 0], [1.0, 18.0], rtol=1e-14)
-    np.testing.assert_allclose(state.covariance[:, 0, 0], [10.0, 40.0], rtol=1e-14)
+    state.mode_probabilities[:] = 0.5
+    out = _advance_one_step(model, state, Recursion())
+    np.testing.assert_allclose(state.mean[0, :, 0, 0], [1.0, 18.0], rtol=1e-14)
+    np.testing.assert_allclose(state.covariance[0, :, 0, 0], [10.0, 40.0], rtol=1e-14)
     # The combination: means 0 and 10, variances 1, probabilities .25 and .75.
-    state.mean[:, 0, 0] = 0.0, 10.0
-    state.covariance[:, 0, 0] = 1.0
-    state.mode_probabilities[:, 0] = 0.25, 0.75
-    _bank.combine(state, out.mean[0], out.covariance[0])
-    np.testing.assert_allclose(out.mean[0, 0, 0], 7.5, rtol=1e-14)
-    np.testing.assert_allclose(out.covariance[0, 0, 0], 19.75, rtol=1e-14)
+    model = scalar_model((1.0, 1.0), matrix=((1.0, 0.0), (0.0, 1.0)))
+    state.mean[:, :, 0] = [[0.0], [10.0]]
+    state.covariance[:] = 1.0
+    state.mode_probabilities[:] = [[0.25], [0.75]]
+    state.log_mode_probabilities[:] = np.log([[0.25], [0.75]])
+    out = _advance_one_step(model, state, Recursion(interaction=NO_INTERACTION))
+    np.testing.assert_allclose(out.mean[0, 0], 7.5, rtol=1e-14)
+    np.testing.assert_allclose(out.covariance[0, 0], 19.75, rtol=1e-14)
+
+
+def _advance_one_step(model, state, recursion):
+    """A step without a scan."""
+    out = _layout.empty_estimates(model, 1, WIDTH, likelihoods=True, covariance=True)
+    z = np.full((1, 1, WIDTH), np.nan)
+    _bank.run_span(state, _layout.workspace(model), _layout.kernel_model(model), recursion, z, out)
+    return out
 
 
 # ---- numbers that break filters --------------------------------------------------------------
@@ -389,7 +396,7 @@ def test_long_run_stays_symmetric_and_positive_definite():
     estimates, state = run_kernel(model, z)
     assert np.isfinite(estimates.mean).all()
     for j in range(2):
-        assert np.linalg.eigvalsh(unpacked(state.covariance[j, :, 0], 6)).min() > -1e-9
+        assert np.linalg.eigvalsh(unpacked(state.covariance[0, j, :, 0], 6)).min() > -1e-9
 
 
 def test_enormous_outlier_leaves_everything_finite():

@@ -8,25 +8,28 @@ from pathlib import Path
 import numpy as np
 
 from hybridtrack import compiled
-from hybridtrack.compiled import exp, kernel, log
+from hybridtrack.compiled import kernel
+from hybridtrack.elementary import exp, log
+from hybridtrack.vectors import WIDTH, load, store
 
 
 @kernel
 def exp_of(x, out):
-    for b in range(x.size):
-        out[b] = exp(x[b])
+    for v in range(x.size // WIDTH):
+        store(out, v, exp(load(x, v)))
 
 
 @kernel
 def log_of(x, out):
-    for b in range(x.size):
-        out[b] = log(x[b])
+    for v in range(x.size // WIDTH):
+        store(out, v, log(load(x, v)))
 
 
 def applied(function, x):
-    out = np.empty_like(x)
-    function(x, out)
-    return out
+    padded = np.concatenate([x, np.ones(-x.size % WIDTH)])
+    out = np.empty_like(padded)
+    function(padded, out)
+    return out[: x.size]
 
 
 def test_exp_is_good_to_two_units_in_the_last_place():

@@ -10,8 +10,9 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from hybridtrack.estimators import _bank
-from hybridtrack.estimators._bank import Array, Estimates, Recursion
+from hybridtrack.estimators import _bank, _layout
+from hybridtrack.estimators._bank import Recursion
+from hybridtrack.estimators._layout import Array, Estimates
 from hybridtrack.models import JumpMarkovModel
 
 __all__ = ["BankEstimator", "Estimates", "Running", "estimators"]
@@ -58,13 +59,13 @@ class Running:
         self._settings = settings
         self._recursion = estimator.recursion(settings)
         self._model = estimator.model(model, settings)
-        self._kernel_model = _bank.kernel_model(self._model)
+        self._kernel_model = _layout.kernel_model(self._model)
         self._given = model
         self._lanes = initial_mean.shape[1]
-        self._state = _bank.start(self._model, self._lanes, initial_mean)
-        self._work = _bank.workspace(self._model, self._lanes)
+        self._state = _layout.start(self._model, self._lanes, initial_mean)
+        self._work = _layout.workspace(self._model)
         self._room: Estimates | None = None
-        self.mode_names = _bank.output_modes(self._model)
+        self.mode_names = _layout.output_modes(self._model)
         self.state_names = self._model.state_names
 
     def advance(
@@ -76,12 +77,12 @@ class Running:
         """
         if model is not self._given:
             self._given = model
-            self._kernel_model = _bank.kernel_model(self._estimator.model(model, self._settings))
+            self._kernel_model = _layout.kernel_model(self._estimator.model(model, self._settings))
         steps = len(measurements)
         room = self._room
         if room is None or len(room.mean) != steps or bool(len(room.covariance)) != covariance:
             likelihoods = len(self.mode_names) > 1
-            room = self._room = _bank.empty_estimates(
+            room = self._room = _layout.empty_estimates(
                 self._model, steps, self._lanes, likelihoods=likelihoods, covariance=covariance
             )
         _bank.run_span(
