@@ -305,6 +305,40 @@ def test_evidence_beyond_the_range_of_a_float_is_not_forgotten():
     assert estimates.mode_probabilities[turn + 2, 0, 0] > 0.5
 
 
+def constant_model(matrix, R=(1.0, 4.0)):
+    """A state known to be 0: the filter is then the exact filter of a hidden Markov chain."""
+    model = scalar_model((1.0, 1.0), matrix=matrix)
+    return model._replace(
+        measurement_matrix=np.ones((2, 1, 1)),
+        measurement_noise_covariance=np.array(R).reshape(2, 1, 1),
+        initial_covariance=np.zeros((1, 1)),
+        initial_mode_probabilities=np.array([0.5, 0.5]),
+    )
+
+
+def test_evidence_against_a_mode_that_nothing_else_feeds_is_not_forgotten():
+    """m0 may end in m1, which is for ever: e**-5000 against m0, and then all for it again."""
+    matrix = np.array([[0.9, 0.1], [0.0, 1.0]])
+    z = np.concatenate([np.full(400, 6.0), np.zeros(12000)])
+    estimates, _ = run_kernel(constant_model(matrix), z[:, np.newaxis, np.newaxis])
+    # Forwards in logarithms; the constant of the likelihood is that of R alone.
+    log_mu = np.log([0.5, 0.5])
+    with np.errstate(divide="ignore"):
+        log_matrix = np.log(matrix)
+    least = 0.0
+    for k, value in enumerate(z):
+        log_mu = np.logaddexp.reduce(log_mu[:, np.newaxis] + log_matrix, axis=0)
+        log_mu = log_mu - 0.5 * (value**2 / np.array([1.0, 4.0]) + np.log([1.0, 4.0]))
+        log_mu = log_mu - np.logaddexp.reduce(log_mu)
+        least = min(least, log_mu[0])
+        # Logarithms of 5000 have 1e-12 of rounding, and 12,000 steps add theirs.
+        np.testing.assert_allclose(
+            estimates.mode_probabilities[k, :, 0], np.exp(log_mu), rtol=1e-7, atol=1e-12
+        )
+    assert least < -4000
+    assert estimates.mode_probabilities[-1, 0, 0] > 0.5
+
+
 def test_unreachable_modes_stay_at_zero_and_finite():
     rng = np.random.default_rng(17)
     model = random_model(rng)._replace(

@@ -1,58 +1,11 @@
-"""The kernels' elementary functions, their cache, and life without compilation."""
+"""The kernels' cache, and life without compilation."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from hybridtrack import compiled
-from hybridtrack.compiled import kernel
-from hybridtrack.elementary import exp, log
-from hybridtrack.vectors import WIDTH, load, store
-
-
-@kernel
-def exp_of(x, out):
-    for v in range(x.size // WIDTH):
-        store(out, v, exp(load(x, v)))
-
-
-@kernel
-def log_of(x, out):
-    for v in range(x.size // WIDTH):
-        store(out, v, log(load(x, v)))
-
-
-def applied(function, x):
-    padded = np.concatenate([x, np.ones(-x.size % WIDTH)])
-    out = np.empty_like(padded)
-    function(padded, out)
-    return out[: x.size]
-
-
-def test_exp_is_good_to_two_units_in_the_last_place():
-    rng = np.random.default_rng(1)
-    x = np.concatenate([-707.9 * rng.random(20000), -(10.0 ** rng.uniform(-20, 0, 2000)), [0.0]])
-    np.testing.assert_allclose(applied(exp_of, x), np.exp(x), rtol=5e-16)
-
-
-def test_exp_at_its_ends():
-    x = np.array([0.0, -708.1, -1e6, -np.inf, np.nan])
-    np.testing.assert_array_equal(applied(exp_of, x), [1.0, 0.0, 0.0, 0.0, np.nan])
-
-
-def test_log_is_good_to_two_units_in_the_last_place():
-    rng = np.random.default_rng(2)
-    x = np.concatenate([10.0 ** rng.uniform(-307, 307, 20000), 1 + rng.uniform(-1, 1, 2000) / 1e6])
-    np.testing.assert_allclose(applied(log_of, x), np.log(x), rtol=5e-16)
-
-
-def test_log_at_its_ends():
-    x = np.array([0.0, 1.0, 5e-324, 1e-310, -1.0, np.nan])
-    with np.errstate(all="ignore"):
-        np.testing.assert_allclose(applied(log_of, x), np.log(x), rtol=5e-16)
 
 
 def test_cache_folder_is_named_by_the_sources():
@@ -121,9 +74,17 @@ def test_a_cache_without_room(tmp_path):
 
 
 def test_small_cases_run_without_compilation():
-    chosen = ["-k", "reference or spans or hand or unreachable"]
+    tests = Path(__file__).parent
+    chosen = ["-k", "vectors or reference or spans or hand or unreachable"]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", Path(__file__).parent / "test_bank.py", *chosen],
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            tests / "test_vectors.py",
+            tests / "test_bank.py",
+            *chosen,
+        ],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
         text=True,
