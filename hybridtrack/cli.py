@@ -239,7 +239,7 @@ def draw_figures(folder: Path) -> list[Path]:
         estimators=tuple(manifest["estimators"]),
         modes=tuple(manifest["modes"]),
     )
-    steps, tracks = (results.read_table(folder, name) for name in ("steps", "tracks"))
+    steps, tracks = (results.read_columns(folder, name) for name in ("steps", "tracks"))
     paths = figures.save(figures.draw(steps, tracks, information), folder / "figures")
     noted = manifest | {"figures": [path.name for path in paths]}
     if noted != manifest and results.read_manifest(folder) == manifest:  # nobody went on meanwhile

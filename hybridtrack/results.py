@@ -8,17 +8,18 @@ longer one's, put together in `unfinished/`, replaces it. Only files named here 
 """
 
 import contextlib
+import csv
+import io
 import json
 import os
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
@@ -214,7 +215,7 @@ class RunFolder:
         with replacing(self.unfinished / f"{name}.parquet") as temporary:
             pq.write_table(table, temporary, compression="zstd")
         if name == "summary":
-            write_text(self.unfinished / CSV, table.to_pandas().to_csv(index=False))
+            write_text(self.unfinished / CSV, _as_csv(table))
 
     def write_manifest(self, manifest: Mapping[str, Any]) -> None:
         """manifest.json; `status` tells whether everything else is there."""
@@ -229,6 +230,16 @@ class RunFolder:
         except OSError as error:
             raise UserError(f"{self.path}: cannot be written ({_reason(error)})") from None
         self.write_manifest({**manifest, "status": COMPLETE})
+
+
+def _as_csv(table: pa.Table) -> str:
+    """A table as CSV: NaN is empty, all other figures are exact."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table.column_names)
+    for row in table.to_pylist():
+        writer.writerow(None if value != value else value for value in row.values())
+    return text.getvalue()
 
 
 def _holds_something(path: Path) -> bool:
@@ -406,19 +417,48 @@ def require_complete(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def read_table(path: Path, name: str) -> pd.DataFrame:
-    """A table of a run folder. Raises UserError where it is missing or damaged."""
+def read_rows(path: Path, name: str) -> list[dict[str, Any]]:
+    """The rows of a table of SCHEMAS. Raises UserError where it is missing or damaged."""
+    rows: list[dict[str, Any]] = _read(path, name).to_pylist()
+    return rows
+
+
+def read_columns(path: Path, name: str) -> dict[str, Array]:
+    """The columns of a table of SCHEMAS, each text held once; long tables are best had so.
+
+    Raises UserError where the table is missing or damaged.
+    """
+    table = _read(path, name, _texts(SCHEMAS[name]))
+    return {column: _values(table[column]) for column in table.column_names}
+
+
+def _read(path: Path, name: str, dictionaries: Sequence[str] = ()) -> pa.Table:
     file = path / f"{name}.parquet"
     try:
-        table = pq.read_table(file)
-        if name in SCHEMAS and not table.schema.remove_metadata().equals(SCHEMAS[name]):
+        if not pq.read_schema(file).remove_metadata().equals(SCHEMAS[name]):
             raise ValueError(f"not the columns of {name}")
-        frame: pd.DataFrame = table.to_pandas()
-        return frame
+        with pq.ParquetFile(file, read_dictionary=dictionaries) as opened:
+            return opened.read()
     except FileNotFoundError:
         raise _missing(file) from None
     except DAMAGE as error:
         raise _damaged(file, error) from None
+
+
+def _texts(schema: pa.Schema) -> list[str]:
+    return [field.name for field in schema if pa.types.is_string(field.type)]
+
+
+def _values(column: pa.ChunkedArray) -> Array:
+    """A column as NumPy has it; a dictionary's entries are shared by all rows that have them."""
+    if not pa.types.is_dictionary(column.type):
+        values: Array = column.to_numpy()
+        return values
+    parts = [
+        np.array([*chunk.dictionary.to_pylist(), None], dtype=object)[chunk.indices.to_numpy()]
+        for chunk in column.chunks
+    ]
+    return np.concatenate(parts) if parts else np.empty(0, dtype=object)
 
 
 def read_runs(path: Path) -> Iterator[pa.Table]:

@@ -405,7 +405,7 @@ def test_steps_equal_recomputation_from_tracks(tmp_path, text):
 def sums_of(result, label, window, metric):
     sums, numbers = result.sums[label, window, METRICS[metric].quantity]
     sound = result.status[label] == 0
-    return RunSums(np.zeros(sums.size, dtype=np.int64), sums, numbers, sound)
+    return RunSums(sums, numbers, sound)
 
 
 def test_standard_errors_are_the_spread_over_seeds(tmp_path):
