@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from hybridtrack import results
+from hybridtrack import columns, results
 from hybridtrack.blocks import RAW, BlockResult, GroupStatistics, Track
 from hybridtrack.config import Experiment
 from hybridtrack.errors import UserError
@@ -38,22 +38,19 @@ def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
     run = np.concatenate([b.task.block * BLOCK_RUNS + np.arange(b.task.runs) for b in blocks])
     stops = np.cumsum([b.task.runs for b in blocks])
     shape = (len(rows), len(windows), run.size)
-    estimator, window, _ = np.indices(shape, dtype=np.int32, sparse=True)
-
-    def text(index: Any, names: Iterable[str]) -> pa.DictionaryArray:
-        codes = np.broadcast_to(index, shape).ravel()
-        return pa.DictionaryArray.from_arrays(codes, pa.array(names, pa.string()))
+    n_cells = len(windows) * run.size
 
     def number(values: Any) -> pa.Array:
-        return pa.array(np.broadcast_to(values, shape).ravel())
+        array = np.broadcast_to(values, shape).ravel()
+        return columns.numbers(array, pa.from_numpy_dtype(array.dtype))
 
     status = np.stack([np.concatenate([block.status[label] for block in blocks]) for label in rows])
-    columns = {
-        "case": text(np.int32(0), [experiment.cases[case].name]),
+    table = {
+        "case": columns.texts([experiment.cases[case].name], len(rows) * n_cells),
         "case_number": number(np.int64(case)),
         "run": number(run),
-        "estimator": text(estimator, rows),
-        "window": text(window, [w.name for w in windows]),
+        "estimator": columns.texts(rows, n_cells),
+        "window": columns.texts([window.name for window in windows] * len(rows), run.size),
         "status": number(status[:, np.newaxis]),
     }
     for quantity in QUANTITIES:
@@ -65,8 +62,8 @@ def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
                     if found is not None:
                         mine = (i, j, slice(stop - block.task.runs, stop))
                         sums[mine], counts[mine] = found
-        columns |= {f"{quantity}_sum": number(sums), f"{quantity}_count": number(counts)}
-    return pa.table(columns)
+        table |= {f"{quantity}_sum": number(sums), f"{quantity}_count": number(counts)}
+    return pa.table(table)
 
 
 def _step_metrics(quantity: str) -> list[tuple[str, bool]]:
@@ -76,7 +73,7 @@ def _step_metrics(quantity: str) -> list[tuple[str, bool]]:
 
 
 def steps_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
-    parts: list[dict[str, Any]] = []
+    parts = []
     for case, group in zip(experiment.cases, cases, strict=True):
         times_s = case.times_s[1:]
         for (label, quantity), moments in group.steps.items():
@@ -88,39 +85,37 @@ def steps_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str
                 for metric, root in _step_metrics(quantity):
                     value = np.sqrt(mean) if root else mean
                     scale = np.where(value > 0, 0.5 / value, 0.0) if root else 1.0
-                    parts.append(
-                        {
-                            "case": np.full(n.size, case.name),
-                            "estimator": np.full(n.size, label),
-                            "step": np.arange(1, n.size + 1, dtype=np.int32),
-                            "time_s": times_s,
-                            "metric": np.full(n.size, metric),
-                            "value": value,
-                            "standard_error": error * scale,
-                        }
-                    )
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                    texts = {"case": case.name, "estimator": label, "metric": metric}
+                    numbers = {"value": value, "standard_error": error * scale}
+                    parts.append((texts, _by_step(times_s) | numbers))
+    return _joined("steps", parts)
 
 
 def tracks_rows(experiment: Experiment, tracks: list[tuple[int, Track]]) -> dict[str, Any]:
     parts = []
-    for case, track in tracks:
-        n = track.values.size
-        parts.append(
-            {
-                "case": np.full(n, experiment.cases[case].name),
-                "run": np.full(n, track.run),
-                "estimator": np.full(n, track.estimator),
-                "step": np.arange(1, n + 1, dtype=np.int32),
-                "time_s": experiment.cases[case].times_s[1:],
-                "quantity": np.full(n, track.quantity),
-                "value": track.values,
-            }
-        )
-    names = results.SCHEMAS["tracks"].names
+    for number, track in tracks:
+        case = experiment.cases[number]
+        texts = {"case": case.name, "estimator": track.estimator, "quantity": track.quantity}
+        run = np.full(track.values.size, track.run)
+        parts.append((texts, _by_step(case.times_s[1:]) | {"run": run, "value": track.values}))
+    return _joined("tracks", parts)
+
+
+Part = tuple[dict[str, str], dict[str, Any]]  # columns of one text each, and of numbers
+
+
+def _by_step(times_s: Any) -> dict[str, Any]:
+    return {"step": np.arange(1, times_s.size + 1, dtype=np.int32), "time_s": times_s}
+
+
+def _joined(table: str, parts: list[Part]) -> dict[str, Any]:
     if not parts:
-        return {name: [] for name in names}
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+        return _columns(table, [])
+    texts, numbers = zip(*parts, strict=True)
+    lengths = [part["step"].size for part in numbers]
+    return {name: columns.texts([part[name] for part in texts], lengths) for name in texts[0]} | {
+        name: np.concatenate([part[name] for part in numbers]) for name in numbers[0]
+    }
 
 
 def labels(experiment: Experiment) -> tuple[str, ...]:
@@ -146,7 +141,7 @@ def summary_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
 
 
 def _columns(table: str, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
-    names = results.SCHEMAS[table].names
+    names = columns.SCHEMAS[table].names
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
@@ -165,14 +160,14 @@ class Pairs:
 
         Raises UserError where a pair isn't among them.
         """
-        labels, windows = (results.names_in(runs, column) for column in ("estimator", "window"))
+        labels, windows = (columns.names_in(runs[column]) for column in ("estimator", "window"))
         shape = (len(labels), len(windows), -1)
         sums, numbers = (
-            np.stack([results.numbers_in(runs, f"{q}_{kind}").reshape(shape) for q in QUANTITIES])
+            np.stack([columns.as_numpy(runs[f"{q}_{kind}"]).reshape(shape) for q in QUANTITIES])
             for kind in ("sum", "count")
         )
-        sound = results.numbers_in(runs, "status").reshape(shape)[:, 0] == 0
-        case = int(results.numbers_in(runs, "case_number")[0])
+        sound = columns.as_numpy(runs["status"]).reshape(shape)[:, 0] == 0
+        case = int(columns.as_numpy(runs["case_number"])[0])
         for (first, second, window), by_case in self._moments.items():
             if not ({first, second} <= set(labels) and window in windows):
                 what = f"no estimator '{first}' or '{second}', or no window '{window}'"

@@ -22,9 +22,9 @@ from typing import IO, Any, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
-from hybridtrack.columns import SCHEMAS as SCHEMAS
+from hybridtrack import columns
+from hybridtrack.columns import SCHEMAS, Array
 from hybridtrack.errors import UserError
 
 MANIFEST = "manifest.json"
@@ -59,7 +59,6 @@ DAMAGE = (
     zlib.error,
     pa.ArrowException,
 )
-Array = NDArray[Any]
 Content = TypeVar("Content")
 
 
@@ -183,7 +182,7 @@ class RunFolder:
                     source = self.path / "runs.parquet"
                     (table,) = _row_groups(source, [self._assembled.index(name)])
                 if writer is None:
-                    writer = stack.enter_context(_runs_writer(temporary, table.schema))
+                    writer = stack.enter_context(_writer(temporary, table.schema))
                     writer.add_key_value_metadata({"shards": json.dumps(names)})
                 elif not table.schema.equals(writer.schema):
                     raise _damaged(source, ValueError("other columns than the rest"))
@@ -210,10 +209,13 @@ class RunFolder:
 
     def write_table(self, name: str, rows: Mapping[str, Any]) -> None:
         """One of SCHEMAS from columns (empty ones too), for `publish`."""
-        table = pa.table(dict(rows), schema=SCHEMAS[name])
+        table = columns.table(name, rows)
         _make(self.unfinished)
-        with replacing(self.unfinished / f"{name}.parquet") as temporary:
-            pq.write_table(table, temporary, compression="zstd")
+        with (
+            replacing(self.unfinished / f"{name}.parquet") as temporary,
+            _writer(temporary, table.schema) as writer,
+        ):
+            writer.write_table(table)
         if name == "summary":
             write_text(self.unfinished / CSV, _as_csv(table))
 
@@ -298,10 +300,10 @@ def _shards_in(path: Path) -> list[str]:
         raise _damaged(path, error) from None
 
 
-def _runs_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    """Sums differ from run to run: a dictionary of them costs time and room, and saves nothing.
+def _writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """Of a table as we keep it. The Arrow schema is left out, so that a reader gets text as text.
 
-    The Arrow schema is left out, so that a reader gets text as text, not as our dictionaries.
+    Hardly a float repeats: dictionaries of them would take time and room.
     """
     repeated = [field.name for field in schema if not pa.types.is_floating(field.type)]
     return pq.ParquetWriter(
@@ -424,12 +426,12 @@ def read_rows(path: Path, name: str) -> list[dict[str, Any]]:
 
 
 def read_columns(path: Path, name: str) -> dict[str, Array]:
-    """The columns of a table of SCHEMAS, each text held once; long tables are best had so.
+    """The columns of a long table, steps or tracks, each different text held once.
 
-    Raises UserError where the table is missing or damaged.
+    Raises UserError where it is missing or damaged.
     """
     table = _read(path, name, _texts(SCHEMAS[name]))
-    return {column: _values(table[column]) for column in table.column_names}
+    return {column: columns.as_numpy(table[column]) for column in table.column_names}
 
 
 def _read(path: Path, name: str, dictionaries: Sequence[str] = ()) -> pa.Table:
@@ -449,33 +451,9 @@ def _texts(schema: pa.Schema) -> list[str]:
     return [field.name for field in schema if pa.types.is_string(field.type)]
 
 
-def _values(column: pa.ChunkedArray) -> Array:
-    """A column as NumPy has it; a dictionary's entries are shared by all rows that have them."""
-    if not pa.types.is_dictionary(column.type):
-        values: Array = column.to_numpy()
-        return values
-    parts = [
-        np.array([*chunk.dictionary.to_pylist(), None], dtype=object)[chunk.indices.to_numpy()]
-        for chunk in column.chunks
-    ]
-    return np.concatenate(parts) if parts else np.empty(0, dtype=object)
-
-
 def read_runs(path: Path) -> Iterator[pa.Table]:
     """The rows of runs.parquet shard by shard, in the order of cases and runs.
 
     A shard's rows go by estimator, window and run; there is each combination of the three.
     """
     yield from _row_groups(path / "runs.parquet")
-
-
-def names_in(runs: pa.Table, column: str) -> list[str]:
-    """The texts of a column of runs, each once."""
-    names: list[str] = runs[column].chunk(0).dictionary.to_pylist()
-    return names
-
-
-def numbers_in(runs: pa.Table, column: str) -> Array:
-    """A column of runs as NumPy has it."""
-    values: Array = runs[column].to_numpy()
-    return values

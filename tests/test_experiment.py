@@ -21,11 +21,10 @@ from hybridtrack.outcomes import paired
 from hybridtrack.results import (
     RunFolder,
     read_manifest,
-    read_table,
     require_complete,
 )
 from hybridtrack.statistics import METRICS, RunSums, compare, pair_moments, ratio_of_sums
-from models import RANDOM, SMALL, scenario
+from models import RANDOM, SMALL, read_table, scenario
 
 TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published")
 

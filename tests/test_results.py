@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hybridtrack.columns import as_numpy, names_in
 from hybridtrack.errors import UserError
 from hybridtrack.experiment import is_complete, run
 from hybridtrack.outcomes import paired
@@ -17,11 +18,10 @@ from hybridtrack.results import (
     SCHEMAS,
     RunFolder,
     clear,
-    names_in,
-    numbers_in,
+    read_columns,
     read_manifest,
+    read_rows,
     read_runs,
-    read_table,
     replacing,
     require_complete,
     write_text,
@@ -292,9 +292,12 @@ def test_a_shard_with_other_content_is_one_sentence(damaged, keys):
 def test_another_table_in_its_place_is_one_sentence(damaged, name):
     _, folder = damaged
     pq.write_table(pa.table({"estimator": ["IMM"]}), folder / f"{name}.parquet")
-    with pytest.raises(UserError, match=rf"{name}.parquet: this file is damaged \(not") as caught:
-        read_table(folder, name)
-    sentence(caught)
+    for read in (read_rows, read_columns):
+        with pytest.raises(
+            UserError, match=rf"{name}.parquet: this file is damaged \(not"
+        ) as caught:
+            read(folder, name)
+        sentence(caught)
 
 
 def test_a_part_of_runs_with_other_columns_is_one_sentence(tmp_path):
@@ -323,7 +326,7 @@ def test_truncated_tables_are_one_sentence(damaged, keep):
     for name in ("summary", "runs"):
         cut(folder / f"{name}.parquet", keep)
     for use in (
-        lambda: read_table(folder, "summary"),
+        lambda: read_rows(folder, "summary"),
         lambda: next(read_runs(folder)),
         lambda: paired(folder, "IMM", "KF", "position_rmse_m", "all"),
         lambda: run(experiment, folder, 1, quiet),
@@ -348,7 +351,7 @@ def test_a_missing_table_is_one_sentence(damaged):
     _, folder = damaged
     for name in ("steps", "runs"):
         (folder / f"{name}.parquet").unlink()
-    for use in (lambda: read_table(folder, "steps"), lambda: next(read_runs(folder))):
+    for use in (lambda: read_columns(folder, "steps"), lambda: next(read_runs(folder))):
         with pytest.raises(UserError, match=r"missing from the run folder; .*--force") as caught:
             use()
         sentence(caught)
@@ -446,7 +449,7 @@ def test_tables_stay_as_they_are_until_they_are_published(tmp_path):
         assert (run_folder / "published.parquet").read_bytes() == before
         folder.write_table("published", row)
         folder.publish(manifest)
-    assert len(read_table(run_folder, "published")) == 1
+    assert read_rows(run_folder, "published") == [dict.fromkeys(names)]
     assert read_manifest(run_folder) == manifest | {"status": "complete"}
 
 
@@ -470,13 +473,13 @@ def test_runs_come_back_by_estimator_window_and_run(finished):
     experiment, folder = finished
     (runs,) = read_runs(folder)  # five runs: one shard
     table = pd.read_parquet(folder / "runs.parquet")
-    labels, windows = names_in(runs, "estimator"), names_in(runs, "window")
+    labels, windows = names_in(runs["estimator"]), names_in(runs["window"])
     assert labels == ["raw", *(chosen.label for chosen in experiment.estimators)]
     assert windows == [window.name for window in experiment.windows]
     expected = [(e, w, r) for e in labels for w in windows for r in range(experiment.runs)]
     assert list(table[["estimator", "window", "run"]].itertuples(index=False)) == expected
     for name in table.columns.drop(["case", "estimator", "window"]):
-        np.testing.assert_array_equal(numbers_in(runs, name), table[name])
+        np.testing.assert_array_equal(as_numpy(runs[name]), table[name])
 
 
 @pytest.mark.parametrize(("estimator", "window"), [("XYZ", "all"), ("IMM", "xyz")])
@@ -487,12 +490,15 @@ def test_a_pair_that_is_not_there_is_one_sentence(finished, estimator, window):
     assert window in sentence(caught)
 
 
-def test_tables_have_their_schema_even_when_empty(tmp_path):
-    names = SCHEMAS["published"].names
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_tables_have_their_schema_even_when_empty(tmp_path, name):
     with RunFolder(tmp_path / "run", "d1") as folder:
-        folder.write_table("published", {name: [] for name in names})
+        folder.write_table(name, {field.name: [] for field in SCHEMAS[name]})
         folder.publish({"digest": "d1"})
-    table = read_table(tmp_path / "run", "published")
-    assert list(table.columns) == names
-    assert table.empty
-    assert table["ours"].dtype == np.float64
+    assert pq.read_schema(tmp_path / "run" / f"{name}.parquet").equals(SCHEMAS[name])
+    assert read_rows(tmp_path / "run", name) == []
+    if name in ("steps", "tracks"):
+        table = read_columns(tmp_path / "run", name)
+        assert list(table) == SCHEMAS[name].names
+        assert {len(column) for column in table.values()} == {0}
+        assert table["value"].dtype == np.float64
