@@ -39,7 +39,7 @@ from hybridtrack.errors import UserError
 Dashes = str | tuple[float, tuple[float, ...]]
 
 DPI = 200
-COMPRESSION = 3  # of 9: more takes twice the time and saves nothing
+COMPRESSION = 3  # of 9: more takes half as long again and saves a tenth
 WIDTH_IN = 7.0  # two columns of a journal page
 HALVES = np.array([-0.5, 0.5])
 LOG_SCALE_RATIO = 15.0
