@@ -3,11 +3,15 @@
 Arrow's own conversions look for pandas, whose import takes longer than writing all tables does.
 """
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -139,3 +143,24 @@ def names_in(column: pa.ChunkedArray) -> list[str]:
     """The texts of a column of one chunk, each once."""
     names: list[str] = column.chunk(0).dictionary.to_pylist()
     return names
+
+
+def writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """Of a table as we keep it. The Arrow schema is left out, so that a reader gets text as text.
+
+    Hardly a float repeats: dictionaries of them would take time and room.
+    """
+    repeated = [field.name for field in schema if not pa.types.is_floating(field.type)]
+    return pq.ParquetWriter(
+        path, schema, compression="zstd", use_dictionary=repeated, store_schema=False
+    )
+
+
+def as_csv(table: pa.Table) -> str:
+    """A table as CSV: NaN is empty, all other figures are exact."""
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(table.column_names)
+    for row in table.to_pylist():
+        lines.writerow(None if value != value else value for value in row.values())
+    return text.getvalue()

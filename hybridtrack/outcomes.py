@@ -38,7 +38,7 @@ def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
     run = np.concatenate([b.task.block * BLOCK_RUNS + np.arange(b.task.runs) for b in blocks])
     stops = np.cumsum([b.task.runs for b in blocks])
     shape = (len(rows), len(windows), run.size)
-    n_cells = len(windows) * run.size
+    per_estimator = len(windows) * run.size
 
     def number(values: Any) -> pa.Array:
         array = np.broadcast_to(values, shape).ravel()
@@ -46,10 +46,10 @@ def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
 
     status = np.stack([np.concatenate([block.status[label] for block in blocks]) for label in rows])
     table = {
-        "case": columns.texts([experiment.cases[case].name], len(rows) * n_cells),
+        "case": columns.texts([experiment.cases[case].name], len(rows) * per_estimator),
         "case_number": number(np.int64(case)),
         "run": number(run),
-        "estimator": columns.texts(rows, n_cells),
+        "estimator": columns.texts(rows, per_estimator),
         "window": columns.texts([window.name for window in windows] * len(rows), run.size),
         "status": number(status[:, np.newaxis]),
     }

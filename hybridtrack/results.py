@@ -8,8 +8,6 @@ longer one's, put together in `unfinished/`, replaces it. Only files named here 
 """
 
 import contextlib
-import csv
-import io
 import json
 import os
 import re
@@ -182,7 +180,7 @@ class RunFolder:
                     source = self.path / "runs.parquet"
                     (table,) = _row_groups(source, [self._assembled.index(name)])
                 if writer is None:
-                    writer = stack.enter_context(_writer(temporary, table.schema))
+                    writer = stack.enter_context(columns.writer(temporary, table.schema))
                     writer.add_key_value_metadata({"shards": json.dumps(names)})
                 elif not table.schema.equals(writer.schema):
                     raise _damaged(source, ValueError("other columns than the rest"))
@@ -213,11 +211,11 @@ class RunFolder:
         _make(self.unfinished)
         with (
             replacing(self.unfinished / f"{name}.parquet") as temporary,
-            _writer(temporary, table.schema) as writer,
+            columns.writer(temporary, table.schema) as writer,
         ):
             writer.write_table(table)
         if name == "summary":
-            write_text(self.unfinished / CSV, _as_csv(table))
+            write_text(self.unfinished / CSV, columns.as_csv(table))
 
     def write_manifest(self, manifest: Mapping[str, Any]) -> None:
         """manifest.json; `status` tells whether everything else is there."""
@@ -232,16 +230,6 @@ class RunFolder:
         except OSError as error:
             raise UserError(f"{self.path}: cannot be written ({_reason(error)})") from None
         self.write_manifest({**manifest, "status": COMPLETE})
-
-
-def _as_csv(table: pa.Table) -> str:
-    """A table as CSV: NaN is empty, all other figures are exact."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.column_names)
-    for row in table.to_pylist():
-        writer.writerow(None if value != value else value for value in row.values())
-    return text.getvalue()
 
 
 def _holds_something(path: Path) -> bool:
@@ -298,17 +286,6 @@ def _shards_in(path: Path) -> list[str]:
         return []
     except DAMAGE as error:
         raise _damaged(path, error) from None
-
-
-def _writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    """Of a table as we keep it. The Arrow schema is left out, so that a reader gets text as text.
-
-    Hardly a float repeats: dictionaries of them would take time and room.
-    """
-    repeated = [field.name for field in schema if not pa.types.is_floating(field.type)]
-    return pq.ParquetWriter(
-        path, schema, compression="zstd", use_dictionary=repeated, store_schema=False
-    )
 
 
 def _arrow_table(path: Path) -> pa.Table:
@@ -430,7 +407,8 @@ def read_columns(path: Path, name: str) -> dict[str, Array]:
 
     Raises UserError where it is missing or damaged.
     """
-    table = _read(path, name, _texts(SCHEMAS[name]))
+    texts = [field.name for field in SCHEMAS[name] if pa.types.is_string(field.type)]
+    table = _read(path, name, texts)
     return {column: columns.as_numpy(table[column]) for column in table.column_names}
 
 
@@ -445,10 +423,6 @@ def _read(path: Path, name: str, dictionaries: Sequence[str] = ()) -> pa.Table:
         raise _missing(file) from None
     except DAMAGE as error:
         raise _damaged(file, error) from None
-
-
-def _texts(schema: pa.Schema) -> list[str]:
-    return [field.name for field in schema if pa.types.is_string(field.type)]
 
 
 def read_runs(path: Path) -> Iterator[pa.Table]:

@@ -125,7 +125,7 @@ def _student(freedom: int) -> float:
         (3 * x**7 + 19 * x**5 + 17 * x**3 - 15 * x) / 384,
         (79 * x**9 + 776 * x**7 + 1482 * x**5 - 1920 * x**3 - 945 * x) / 92160,
     )
-    return sum(term / freedom**i for i, term in enumerate(terms))
+    return sum(term / float(freedom) ** i for i, term in enumerate(terms))
 
 
 def _outcome(claim: Claim, ours: Estimate, verdict: str) -> Outcome:
