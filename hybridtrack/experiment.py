@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from hybridtrack import __version__, outcomes, results
 from hybridtrack.blocks import (
-    BlockResult,
     BlockTask,
     GroupStatistics,
     Track,
@@ -29,7 +27,7 @@ from hybridtrack.config import Experiment, dump
 from hybridtrack.executors import in_order
 from hybridtrack.results import RunFolder
 from hybridtrack.simulation import BLOCK_RUNS
-from hybridtrack.statistics import QUANTITIES, Moments, SumMoments
+from hybridtrack.statistics import Moments, SumMoments
 
 SHARD_BLOCKS = 8  # blocks whose statistics are put away together
 
@@ -109,15 +107,14 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
             cases[case] = merge(cases[case], group) if case in cases else group
             tracks += [(case, track) for track in kept]
         names = [shard.name for shard in shards]
-        n_cells = len(outcomes.labels(experiment)) * len(experiment.windows)
-        folder.assemble_runs(names, n_cells)
+        pairs = outcomes.pairs_wanted(experiment)
+        folder.assemble_runs(names, pairs.add)
         merged = [cases[c] for c in range(len(experiment.cases))]
         folder.write_table("steps", outcomes.steps_rows(experiment, merged))
         folder.write_table("tracks", outcomes.tracks_rows(experiment, tracks))
         folder.write_table("summary", outcomes.summary_rows(experiment, merged))
-        into = folder.unfinished
-        folder.write_table("comparisons", outcomes.comparisons_rows(experiment, into))
-        folder.write_table("published", outcomes.published_rows(experiment, into, merged))
+        folder.write_table("comparisons", outcomes.comparisons_rows(experiment, pairs))
+        folder.write_table("published", outcomes.published_rows(experiment, pairs, merged))
         manifest |= {
             "finished": _now(),
             "diverged": {
@@ -126,7 +123,7 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
                 if (count := sum(group.diverged[label] for group in merged))
             },
         }
-        results.write_text(into / results.CONFIG, dump(experiment.resolved))
+        results.write_text(folder.unfinished / results.CONFIG, dump(experiment.resolved))
         folder.publish(manifest)
         folder.drop_parts(names)
 
@@ -180,8 +177,8 @@ def _shard_statistics(
                 for block in blocks[1:]:
                     group = merge(group, summarise(block))
                 tracks = [track for block in blocks for track in block.tracks]
-                cells = _run_cells(experiment, blocks)
-                folder.save_shard(shard.name, _pack(group, tracks), cells)
+                runs = outcomes.runs_table(experiment, blocks)
+                folder.save_shard(shard.name, _pack(group, tracks), runs)
             yield shard, group, tracks
     finally:
         block_results.close()  # type: ignore[attr-defined]  # stops the threads
@@ -217,37 +214,6 @@ def _unpack(arrays: dict[str, Any]) -> tuple[GroupStatistics, list[Track]]:
         for k, a in zip(keys["tracks"], arrays["tracks"], strict=True)
     ]
     return GroupStatistics(steps, windows, keys["diverged"]), tracks
-
-
-def _run_cells(experiment: Experiment, blocks: list[BlockResult]) -> list[pa.Table]:
-    """Rows of runs.parquet by estimator and window: one per run, with sums and counts."""
-    name = experiment.cases[blocks[0].task.case].name
-    case = blocks[0].task.case
-    numbers = [b.task.block * BLOCK_RUNS + np.arange(b.task.runs) for b in blocks]
-    run = np.concatenate(numbers)
-    cells = []
-    for label in outcomes.labels(experiment):
-        status = np.concatenate([block.status[label] for block in blocks])
-        for window in experiment.windows:
-            columns: dict[str, Any] = {
-                "case": pa.array([name] * run.size),
-                "case_number": np.full(run.size, case),
-                "run": run,
-                "estimator": pa.array([label] * run.size),
-                "window": pa.array([window.name] * run.size),
-                "status": status,
-            }
-            for quantity in QUANTITIES:
-                key = (label, window.name, quantity)
-                sums = [
-                    block.sums.get(key, (np.full(n.size, np.nan), np.zeros(n.size)))
-                    for block, n in zip(blocks, numbers, strict=True)
-                ]
-                columns[f"{quantity}_sum"] = np.concatenate([s[0] for s in sums])
-                counts = np.concatenate([s[1] for s in sums])
-                columns[f"{quantity}_count"] = counts.astype(np.int64)
-            cells.append(pa.table(columns))
-    return cells
 
 
 # ---- what made it ----------------------------------------------------------------------------

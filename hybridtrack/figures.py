@@ -14,21 +14,22 @@ from typing import Any, NamedTuple
 
 import matplotlib.style
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from PIL import Image
 
 from hybridtrack.curves import (
     Array,
     Case,
     Curve,
+    Table,
     Truth,
     broken_at_gaps,
+    chosen_curves,
     isolated,
     mode_names,
-    read_curves,
     read_paths,
     split_cases,
     switch_times,
@@ -38,6 +39,7 @@ from hybridtrack.errors import UserError
 Dashes = str | tuple[float, tuple[float, ...]]
 
 DPI = 200
+COMPRESSION = 3  # of 9: more takes half as long again and saves a tenth
 WIDTH_IN = 7.0  # two columns of a journal page
 HALVES = np.array([-0.5, 0.5])
 LOG_SCALE_RATIO = 15.0
@@ -93,9 +95,7 @@ class Look(NamedTuple):
 Looks = Mapping[str, Look]
 
 
-def draw(
-    steps: pd.DataFrame, tracks: pd.DataFrame, information: RunInformation
-) -> dict[str, Figure]:
+def draw(steps: Table, tracks: Table, information: RunInformation) -> dict[str, Figure]:
     """Draw what the tables of a run folder hold; a figure whose data are absent is left out.
 
     Args:
@@ -137,10 +137,16 @@ def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
 
 
 def _save_one(figure: Figure, path: Path) -> Path:
+    """What savefig does, but laid out once, drawn once, and without the alpha of a white page."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
     try:
         with _style():
-            figure.savefig(partial, format="png", dpi=DPI, metadata={"Software": None})
+            canvas.draw()  # type: ignore[no-untyped-call]
+        pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+        image = Image.fromarray(pixels).convert("RGB")
+        image.save(partial, format="png", dpi=(DPI, DPI), compress_level=COMPRESSION)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -154,9 +160,7 @@ def _style() -> Iterator[None]:
         yield
 
 
-def _looks(
-    steps: pd.DataFrame, tracks: pd.DataFrame, information: RunInformation
-) -> dict[str, Look]:
+def _looks(steps: Table, tracks: Table, information: RunInformation) -> dict[str, Look]:
     """Colour and dashes by the scenario's order of estimators; the raw measurements come first."""
     names = dict.fromkeys([*information.estimators, *steps["estimator"], *tracks["estimator"]])
     estimators = [name for name in names if name not in ("raw", "truth", "measurement")]
@@ -170,22 +174,18 @@ def _looks(
 # ---- the trajectory ----
 
 
-def _draw_trajectory(
-    tracks: pd.DataFrame, looks: Looks, information: RunInformation
-) -> Figure | None:
+def _draw_trajectory(tracks: Table, looks: Looks, information: RunInformation) -> Figure | None:
     """One run in the plane (east, north), or its position over time if it has one dimension."""
-    if tracks.empty:
+    if not len(tracks["case"]):
         return None
-    case, run = tracks["case"].iloc[0], tracks["run"].iloc[0]
-    one = tracks[(tracks["case"] == case) & (tracks["run"] == run)]
-    plane = bool(one.loc[one["quantity"] == "y", "value"].notna().any())
-    paths = read_paths(one, plane)
+    case, run = (np.asarray(tracks[column])[0] for column in ("case", "run"))
+    paths, plane = read_paths(tracks, case, run)
     if not paths:
         return None
     figure, (ax,) = _panels(1, 1, 3.2)
     _plot_paths(ax, paths, looks)
     leaving = _frame_trajectory(figure, ax, paths, plane)
-    where = f"case {case}, " if tracks["case"].nunique() > 1 else ""
+    where = f"case {case}, " if len(set(tracks["case"])) > 1 else ""
     _finish(figure, information.title, f"Trajectory, {where}run {run}", leaving)
     return figure
 
@@ -254,7 +254,7 @@ def _extent(paths: Iterable[Array]) -> Array:
 
 
 def _draw_error(case: Case, quantity: str, unit: str, looks: Looks, runs: int) -> Figure | None:
-    curves = read_curves(case.steps, f"{quantity}_rmse_{unit.replace('/', '_')}", looks)
+    curves = chosen_curves(case.curves, f"{quantity}_rmse_{unit.replace('/', '_')}", looks)
     if not curves:
         return None
     figure, (ax,) = _panels(1, 1, 3.0)
@@ -272,8 +272,9 @@ def _draw_modes(
     case: Case, metric: str, looks: Looks, information: RunInformation
 ) -> Figure | None:
     """One panel per mode on shared axes, so that a panel compares the estimators."""
-    modes = dict.fromkeys([*information.modes, *mode_names(case.steps, metric)])
-    panels = {mode: read_curves(case.steps, f"{metric}:{mode}", looks) for mode in modes}
+    named = mode_names((name for _, name in case.curves), metric)
+    modes = dict.fromkeys([*information.modes, *named])
+    panels = {mode: chosen_curves(case.curves, f"{metric}:{mode}", looks) for mode in modes}
     panels = {mode: curves for mode, curves in panels.items() if curves}
     if not panels:
         return None
@@ -384,7 +385,7 @@ def _frame_time(bottom: Iterable[Axes], curves: Iterable[Curve], truth: Truth | 
 
 
 def _panels(rows: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     return figure, list(axes.flat)

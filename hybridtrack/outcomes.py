@@ -1,19 +1,23 @@
 """From merged statistics to the rows of a run folder's tables, verdicts among them."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
-from hybridtrack import results
-from hybridtrack.blocks import RAW, GroupStatistics, Track
+from hybridtrack import columns, results
+from hybridtrack.blocks import RAW, BlockResult, GroupStatistics, Track
 from hybridtrack.config import Experiment
+from hybridtrack.errors import UserError
+from hybridtrack.simulation import BLOCK_RUNS
 from hybridtrack.statistics import (
     METRICS,
     POSITION,
     POSITION_AT_SCANS,
+    QUANTITIES,
     Estimate,
     Metric,
     Paired,
@@ -27,6 +31,41 @@ from hybridtrack.statistics import (
 from hybridtrack.verdicts import Claim, Outcome, judge_comparison, judge_figure
 
 
+def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
+    """A shard's rows of runs.parquet: by estimator, window and run, with sums and counts."""
+    rows, windows = labels(experiment), experiment.windows
+    case = blocks[0].task.case
+    run = np.concatenate([b.task.block * BLOCK_RUNS + np.arange(b.task.runs) for b in blocks])
+    stops = np.cumsum([b.task.runs for b in blocks])
+    shape = (len(rows), len(windows), run.size)
+    per_estimator = len(windows) * run.size
+
+    def number(values: Any) -> pa.Array:
+        array = np.broadcast_to(values, shape).ravel()
+        return columns.numbers(array, pa.from_numpy_dtype(array.dtype))
+
+    status = np.stack([np.concatenate([block.status[label] for block in blocks]) for label in rows])
+    table = {
+        "case": columns.texts([experiment.cases[case].name], len(rows) * per_estimator),
+        "case_number": number(np.int64(case)),
+        "run": number(run),
+        "estimator": columns.texts(rows, per_estimator),
+        "window": columns.texts([window.name for window in windows] * len(rows), run.size),
+        "status": number(status[:, np.newaxis]),
+    }
+    for quantity in QUANTITIES:
+        sums, counts = np.full(shape, np.nan), np.zeros(shape, dtype=np.int64)
+        for i, label in enumerate(rows):
+            for j, chosen in enumerate(windows):
+                for block, stop in zip(blocks, stops, strict=True):
+                    found = block.sums.get((label, chosen.name, quantity))
+                    if found is not None:
+                        mine = (i, j, slice(stop - block.task.runs, stop))
+                        sums[mine], counts[mine] = found
+        table |= {f"{quantity}_sum": number(sums), f"{quantity}_count": number(counts)}
+    return pa.table(table)
+
+
 def _step_metrics(quantity: str) -> list[tuple[str, bool]]:
     """Metrics of a quantity as steps.parquet has them: name, and whether a root is taken."""
     found = [(name, m.root) for name, m in METRICS.items() if m.quantity == quantity]
@@ -34,7 +73,7 @@ def _step_metrics(quantity: str) -> list[tuple[str, bool]]:
 
 
 def steps_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
-    parts: list[dict[str, Any]] = []
+    parts = []
     for case, group in zip(experiment.cases, cases, strict=True):
         times_s = case.times_s[1:]
         for (label, quantity), moments in group.steps.items():
@@ -46,39 +85,37 @@ def steps_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str
                 for metric, root in _step_metrics(quantity):
                     value = np.sqrt(mean) if root else mean
                     scale = np.where(value > 0, 0.5 / value, 0.0) if root else 1.0
-                    parts.append(
-                        {
-                            "case": np.full(n.size, case.name),
-                            "estimator": np.full(n.size, label),
-                            "step": np.arange(1, n.size + 1, dtype=np.int32),
-                            "time_s": times_s,
-                            "metric": np.full(n.size, metric),
-                            "value": value,
-                            "standard_error": error * scale,
-                        }
-                    )
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                    texts = {"case": case.name, "estimator": label, "metric": metric}
+                    numbers = {"value": value, "standard_error": error * scale}
+                    parts.append((texts, _by_step(times_s) | numbers))
+    return _joined("steps", parts)
 
 
 def tracks_rows(experiment: Experiment, tracks: list[tuple[int, Track]]) -> dict[str, Any]:
     parts = []
-    for case, track in tracks:
-        n = track.values.size
-        parts.append(
-            {
-                "case": np.full(n, experiment.cases[case].name),
-                "run": np.full(n, track.run),
-                "estimator": np.full(n, track.estimator),
-                "step": np.arange(1, n + 1, dtype=np.int32),
-                "time_s": experiment.cases[case].times_s[1:],
-                "quantity": np.full(n, track.quantity),
-                "value": track.values,
-            }
-        )
-    names = results.SCHEMAS["tracks"].names
+    for number, track in tracks:
+        case = experiment.cases[number]
+        texts = {"case": case.name, "estimator": track.estimator, "quantity": track.quantity}
+        run = np.full(track.values.size, track.run)
+        parts.append((texts, _by_step(case.times_s[1:]) | {"run": run, "value": track.values}))
+    return _joined("tracks", parts)
+
+
+Part = tuple[dict[str, str], dict[str, Any]]  # columns of one text each, and of numbers
+
+
+def _by_step(times_s: Any) -> dict[str, Any]:
+    return {"step": np.arange(1, times_s.size + 1, dtype=np.int32), "time_s": times_s}
+
+
+def _joined(table: str, parts: list[Part]) -> dict[str, Any]:
     if not parts:
-        return {name: [] for name in names}
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+        return _columns(table, [])
+    texts, numbers = zip(*parts, strict=True)
+    lengths = [part["step"].size for part in numbers]
+    return {name: columns.texts([part[name] for part in texts], lengths) for name in texts[0]} | {
+        name: np.concatenate([part[name] for part in numbers]) for name in numbers[0]
+    }
 
 
 def labels(experiment: Experiment) -> tuple[str, ...]:
@@ -104,51 +141,85 @@ def summary_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
 
 
 def _columns(table: str, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
-    names = results.SCHEMAS[table].names
+    names = columns.SCHEMAS[table].names
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
 
+Pair = tuple[str, str, str]  # first and second estimator, window
+
+
+class Pairs:
+    """Pairs of estimators compared over the same runs, which come shard by shard."""
+
+    def __init__(self, wanted: Iterable[Pair]) -> None:
+        # By case; leading axis of the moments: QUANTITIES.
+        self._moments: dict[Pair, dict[int, PairMoments]] = {pair: {} for pair in wanted}
+
+    def add(self, runs: pa.Table) -> None:
+        """The runs of the next shard, as runs.parquet has them.
+
+        Raises UserError where a pair isn't among them.
+        """
+        labels, windows = (columns.names_in(runs[column]) for column in ("estimator", "window"))
+        shape = (len(labels), len(windows), -1)
+        sums, numbers = (
+            np.stack([columns.as_numpy(runs[f"{q}_{kind}"]).reshape(shape) for q in QUANTITIES])
+            for kind in ("sum", "count")
+        )
+        sound = columns.as_numpy(runs["status"]).reshape(shape)[:, 0] == 0
+        case = int(columns.as_numpy(runs["case_number"])[0])
+        for (first, second, window), by_case in self._moments.items():
+            if not ({first, second} <= set(labels) and window in windows):
+                what = f"no estimator '{first}' or '{second}', or no window '{window}'"
+                raise UserError(f"the run holds {what}")
+            w = windows.index(window)
+            one, two = (
+                RunSums(sums[:, i, w], numbers[:, i, w], sound[i])
+                for i in (labels.index(first), labels.index(second))
+            )
+            moments = pair_moments(one, two)
+            by_case[case] = merge_pairs(by_case[case], moments) if case in by_case else moments
+
+    def compare(self, pair: Pair, metric: str) -> Paired:
+        """A metric of a pair; where one is raw, at the scans that it has."""
+        quantity, root = METRICS[metric].quantity, METRICS[metric].root
+        if RAW in pair[:2] and quantity == POSITION:  # no measurement where the scan is missed
+            quantity = POSITION_AT_SCANS
+        q = QUANTITIES.index(quantity)
+        cases = [PairMoments(*(of[q] for of in case)) for case in self._moments[pair].values()]
+        return compare(cases, root)
+
+
+def pairs_wanted(experiment: Experiment) -> Pairs:
+    """Every estimator against `compare_with` in every window, and what is claimed."""
+    second = experiment.compare_with
+    wanted: dict[Pair, None] = {}
+    if second is not None:
+        for window in experiment.windows:
+            firsts = (first for first in labels(experiment) if first != second)
+            wanted |= dict.fromkeys((first, second, window.name) for first in firsts)
+    claimed = ((*c.compare, c.window) for c in experiment.claims if c.compare is not None)
+    return Pairs(wanted | dict.fromkeys(claimed))
+
+
 def paired(path: Path, first: str, second: str, metric: str, window: str) -> Paired:
-    """Two estimators of a run folder compared over the same runs (and scans, if one is raw)."""
-    return _paired(path, first, second, window, [metric])[metric]
+    """Two estimators of a finished run folder compared over the same runs."""
+    pair = (first, second, window)
+    pairs = Pairs([pair])
+    for runs in results.read_runs(path):
+        pairs.add(runs)
+    return pairs.compare(pair, metric)
 
 
-def _paired(
-    path: Path, first: str, second: str, window: str, metrics: Iterable[str]
-) -> dict[str, Paired]:
-    """Comparisons by metric; memory holds the runs of one shard at a time."""
-    quantities = {metric: METRICS[metric].quantity for metric in metrics}
-    if RAW in (first, second):  # there is a measurement only where the scan isn't missed
-        exchanged = {POSITION: POSITION_AT_SCANS}
-        quantities = {m: exchanged.get(q, q) for m, q in quantities.items()}
-    pairs: dict[str, dict[int, PairMoments]] = {q: {} for q in quantities.values()}
-    shards = [results.run_sums(path, label, window) for label in (first, second)]
-    for one, two in zip(*shards, strict=True):
-        for quantity in pairs:
-            moments = pair_moments(_run_sums(one, quantity), _run_sums(two, quantity))
-            pairs[quantity] = merge_pairs(pairs[quantity], moments)
-    return {m: compare(pairs[q], METRICS[m].root) for m, q in quantities.items()}
-
-
-def _run_sums(columns: Mapping[str, Any], quantity: str) -> RunSums:
-    return RunSums(
-        case=columns["case_number"],
-        sums=columns[f"{quantity}_sum"],
-        numbers=columns[f"{quantity}_count"],
-        sound=columns["status"] == 0,
-    )
-
-
-def comparisons_rows(experiment: Experiment, path: Path) -> dict[str, Any]:
+def comparisons_rows(experiment: Experiment, pairs: Pairs) -> dict[str, Any]:
     """Every estimator against `compare_with`, window by window, metric by metric."""
     rows: list[tuple[Any, ...]] = []
     second = experiment.compare_with
     for window in experiment.windows if second is not None else ():
         assert second is not None
         for first in labels(experiment):
-            if first == second:
-                continue
-            for metric, pair in _paired(path, first, second, window.name, METRICS).items():
+            for metric in METRICS if first != second else ():
+                pair = pairs.compare((first, second, window.name), metric)
                 n = pair.difference.n_runs
                 if n:
                     figures = (*pair.difference[:2], *pair.ratio[:2], n)
@@ -157,11 +228,11 @@ def comparisons_rows(experiment: Experiment, path: Path) -> dict[str, Any]:
 
 
 def published_rows(
-    experiment: Experiment, path: Path, cases: list[GroupStatistics]
+    experiment: Experiment, pairs: Pairs, cases: list[GroupStatistics]
 ) -> dict[str, Any]:
     rows = []
     for claim in experiment.claims:
-        outcome = _judge(experiment, path, cases, claim)
+        outcome = _judge(experiment, pairs, cases, claim)
         ours = outcome.ours
         rows.append(
             (
@@ -183,11 +254,11 @@ def published_rows(
 
 
 def _judge(
-    experiment: Experiment, path: Path, cases: list[GroupStatistics], claim: Claim
+    experiment: Experiment, pairs: Pairs, cases: list[GroupStatistics], claim: Claim
 ) -> Outcome:
     assumed = bool(experiment.assumptions)
     if claim.compare is not None:
-        pair = paired(path, *claim.compare, claim.metric, claim.window)
+        pair = pairs.compare((*claim.compare, claim.window), claim.metric)
         return judge_comparison(claim, pair, assumed)
     assert claim.estimator is not None
     ours = _pooled(cases, claim.estimator, claim.window, METRICS[claim.metric])

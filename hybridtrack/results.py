@@ -13,17 +13,16 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
-from hybridtrack.columns import SCHEMAS as SCHEMAS
+from hybridtrack import columns
+from hybridtrack.columns import SCHEMAS, Array
 from hybridtrack.errors import UserError
 
 MANIFEST = "manifest.json"
@@ -58,7 +57,6 @@ DAMAGE = (
     zlib.error,
     pa.ArrowException,
 )
-Array = NDArray[Any]
 Content = TypeVar("Content")
 
 
@@ -134,22 +132,22 @@ class RunFolder:
     def has_shard(self, name: str) -> bool:
         """Whether the statistics and the runs of a shard are at hand."""
         return (self._shards / f"{name}.npz").exists() and (
-            (self._shards / f"{name}.parquet").exists() or name in self._assembled
+            (self._shards / f"{name}.arrow").exists() or name in self._assembled
         )
 
-    def save_shard(self, name: str, arrays: Mapping[str, Any], cells: Sequence[pa.Table]) -> None:
+    def save_shard(self, name: str, arrays: Mapping[str, Any], runs: pa.Table) -> None:
         """Put a shard away: its runs first, so that statistics are never without them.
 
-        cells: a table of runs per estimator and window, always in the same order; each becomes a
-        row group, so that one can be read without the others.
+        The runs go into an Arrow file with LZ4, a tenth of the work that Parquet is.
         """
         _make(self._shards)
+        options = pa.ipc.IpcWriteOptions(compression="lz4")
         with (
-            replacing(self._shards / f"{name}.parquet") as temporary,
-            pq.ParquetWriter(temporary, cells[0].schema, compression="zstd") as writer,
+            replacing(self._shards / f"{name}.arrow") as temporary,
+            temporary.open("wb") as file,
+            pa.ipc.new_file(file, runs.schema, options=options) as writer,
         ):
-            for cell in cells:
-                writer.write_table(cell)
+            writer.write_table(runs)
         with replacing(self._shards / f"{name}.npz") as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
 
@@ -162,13 +160,12 @@ class RunFolder:
         except DAMAGE as error:
             raise _damaged(path, error) from None
 
-    def assemble_runs(self, names: list[str], n_cells: int) -> None:
-        """The next runs.parquet from the shards' row groups; memory holds one at a time.
+    def assemble_runs(self, names: list[str], look: Callable[[pa.Table], None]) -> None:
+        """The next runs.parquet, a row group per shard, each shown to `look` on its way.
 
-        The file says which shards it holds, so that it can be gone on from whenever this process
-        is killed.
+        Memory holds one at a time. The file says which shards it holds, so that it can be gone on
+        from whenever this process is killed.
         """
-        present = self.path / "runs.parquet"
         _make(self.unfinished)
         with (
             replacing(self.unfinished / "runs.parquet") as temporary,
@@ -176,17 +173,19 @@ class RunFolder:
         ):
             writer: pq.ParquetWriter | None = None
             for name in names:
-                source, first = self._shards / f"{name}.parquet", 0
-                if not source.exists():
-                    source, first = present, n_cells * self._assembled.index(name)
-                for table in _row_groups(source, first, n_cells):
-                    if writer is None:
-                        schema = table.schema.with_metadata({"shards": json.dumps(names)})
-                        writer = pq.ParquetWriter(temporary, schema, compression="zstd")
-                        stack.callback(writer.close)
-                    elif not table.schema.equals(writer.schema):
-                        raise _damaged(source, ValueError("other columns than the rest"))
-                    writer.write_table(table)
+                source = self._shards / f"{name}.arrow"
+                if source.exists():
+                    table = _arrow_table(source)
+                else:
+                    source = self.path / "runs.parquet"
+                    (table,) = _row_groups(source, [self._assembled.index(name)])
+                if writer is None:
+                    writer = stack.enter_context(columns.writer(temporary, table.schema))
+                    writer.add_key_value_metadata({"shards": json.dumps(names)})
+                elif not table.schema.equals(writer.schema):
+                    raise _damaged(source, ValueError("other columns than the rest"))
+                writer.write_table(table, row_group_size=table.num_rows)
+                look(table)
 
     def drop_parts(self, names: list[str]) -> None:
         """Remove what runs.parquet now holds, and shards that have grown.
@@ -198,7 +197,7 @@ class RunFolder:
         def is_done_with(name: str) -> bool:
             stem, _, suffix = name.partition(".")
             shard = SHARD_NAME.fullmatch(stem)
-            if PART_NAME.fullmatch(name) or (stem in names and suffix == "parquet"):
+            if PART_NAME.fullmatch(name) or (stem in names and suffix == "arrow"):
                 return True
             return shard is not None and int(shard["runs"]) < held.get(shard["place"], 0)
 
@@ -208,12 +207,15 @@ class RunFolder:
 
     def write_table(self, name: str, rows: Mapping[str, Any]) -> None:
         """One of SCHEMAS from columns (empty ones too), for `publish`."""
-        table = pa.table(dict(rows), schema=SCHEMAS[name])
+        table = columns.table(name, rows)
         _make(self.unfinished)
-        with replacing(self.unfinished / f"{name}.parquet") as temporary:
-            pq.write_table(table, temporary, compression="zstd")
+        with (
+            replacing(self.unfinished / f"{name}.parquet") as temporary,
+            columns.writer(temporary, table.schema) as writer,
+        ):
+            writer.write_table(table)
         if name == "summary":
-            write_text(self.unfinished / CSV, table.to_pandas().to_csv(index=False))
+            write_text(self.unfinished / CSV, columns.as_csv(table))
 
     def write_manifest(self, manifest: Mapping[str, Any]) -> None:
         """manifest.json; `status` tells whether everything else is there."""
@@ -246,7 +248,7 @@ def _is_table(name: str) -> bool:
 
 def _is_shard(name: str) -> bool:
     stem, _, suffix = name.partition(".")
-    shard = SHARD_NAME.fullmatch(stem) and suffix in ("npz", "parquet")
+    shard = SHARD_NAME.fullmatch(stem) and suffix in ("npz", "arrow")
     return bool(shard or PART_NAME.fullmatch(name))
 
 
@@ -278,7 +280,7 @@ def _missing(path: Path) -> UserError:
 def _shards_in(path: Path) -> list[str]:
     """The shards whose runs a runs.parquet holds; none where there is no such file."""
     try:
-        names = json.loads((pq.read_schema(path).metadata or {})[b"shards"])
+        names = json.loads((pq.read_metadata(path).metadata or {})[b"shards"])
         return [str(name) for name in names]
     except FileNotFoundError:
         return []
@@ -286,12 +288,23 @@ def _shards_in(path: Path) -> list[str]:
         raise _damaged(path, error) from None
 
 
-def _row_groups(path: Path, first: int, number: int) -> Iterator[pa.Table]:
-    """Some row groups of a file, in order. Raises UserError where it is damaged."""
+def _arrow_table(path: Path) -> pa.Table:
+    """The table of an Arrow file. Raises UserError where it is damaged."""
     try:
-        with pq.ParquetFile(path) as file:
-            for group in range(first, first + number):
+        with path.open("rb") as file, pa.ipc.open_file(file) as reader:
+            return reader.read_all()
+    except DAMAGE as error:
+        raise _damaged(path, error) from None
+
+
+def _row_groups(path: Path, groups: Iterable[int] | None = None) -> Iterator[pa.Table]:
+    """Row groups of a runs.parquet, all or some. Raises UserError where it is damaged."""
+    try:
+        with pq.ParquetFile(path, read_dictionary=["case", "estimator", "window"]) as file:
+            for group in range(file.num_row_groups) if groups is None else groups:
                 yield file.read_row_group(group)
+    except FileNotFoundError:
+        raise _missing(path) from None
     except DAMAGE as error:
         raise _damaged(path, error) from None
 
@@ -383,47 +396,38 @@ def require_complete(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def read_table(path: Path, name: str) -> pd.DataFrame:
-    """A table of a run folder. Raises UserError where it is missing or damaged."""
+def read_rows(path: Path, name: str) -> list[dict[str, Any]]:
+    """The rows of a table of SCHEMAS. Raises UserError where it is missing or damaged."""
+    rows: list[dict[str, Any]] = _read(path, name).to_pylist()
+    return rows
+
+
+def read_columns(path: Path, name: str) -> dict[str, Array]:
+    """The columns of a long table, steps or tracks, each different text held once.
+
+    Raises UserError where it is missing or damaged.
+    """
+    texts = [field.name for field in SCHEMAS[name] if pa.types.is_string(field.type)]
+    table = _read(path, name, texts)
+    return {column: columns.as_numpy(table[column]) for column in table.column_names}
+
+
+def _read(path: Path, name: str, dictionaries: Sequence[str] = ()) -> pa.Table:
     file = path / f"{name}.parquet"
     try:
-        table = pq.read_table(file)
-        if name in SCHEMAS and not table.schema.remove_metadata().equals(SCHEMAS[name]):
+        if not pq.read_schema(file).remove_metadata().equals(SCHEMAS[name]):
             raise ValueError(f"not the columns of {name}")
-        frame: pd.DataFrame = table.to_pandas()
-        return frame
+        with pq.ParquetFile(file, read_dictionary=dictionaries) as opened:
+            return opened.read()
     except FileNotFoundError:
         raise _missing(file) from None
     except DAMAGE as error:
         raise _damaged(file, error) from None
 
 
-def run_sums(path: Path, estimator: str, window: str) -> Iterator[dict[str, Array]]:
-    """One estimator's runs in one window, shard by shard, in the order of cases and runs.
+def read_runs(path: Path) -> Iterator[pa.Table]:
+    """The rows of runs.parquet shard by shard, in the order of cases and runs.
 
-    Each is case_number, status, and QUANTITY_sum and QUANTITY_count, arrays (n_runs,).
+    A shard's rows go by estimator, window and run; there is each combination of the three.
     """
-    path = path / "runs.parquet"
-    found = False
-    try:
-        with pq.ParquetFile(path) as file:
-            names = file.schema_arrow.names
-            place = [names.index(name) for name in ("estimator", "window")]
-            numbers = [name for name in names if name.endswith(("_number", "_sum", "_count"))]
-            for group in range(file.num_row_groups):
-                columns = [file.metadata.row_group(group).column(i).statistics for i in place]
-                if [column.min for column in columns] == [estimator, window]:
-                    found = True
-                    table = file.read_row_group(group, columns=[*numbers, "status"])
-                    yield {name: _column(table, name) for name in table.column_names}
-    except FileNotFoundError:
-        raise _missing(path) from None
-    except DAMAGE as error:
-        raise _damaged(path, error) from None
-    if not found:
-        raise UserError(f"{path}: holds no estimator '{estimator}' with a window '{window}'")
-
-
-def _column(table: pa.Table, name: str) -> Array:
-    values: Array = table[name].to_numpy(zero_copy_only=False)
-    return values
+    yield from _row_groups(path / "runs.parquet")

@@ -338,11 +338,10 @@ def ratio_of_sums(cases: Sequence[tuple[float, ...]], root: bool) -> Estimate:
 
 
 class RunSums(NamedTuple):
-    """One estimator's sums in one window, run by run, in one order for all estimators."""
+    """One estimator's sums in one window, run by run, in one order for all; leading axes free."""
 
-    case: NDArray[np.int64]  # (n_runs,)
-    sums: Array  # (n_runs,)
-    numbers: Array  # (n_runs,)
+    sums: Array  # (..., n_runs)
+    numbers: Array  # (..., n_runs)
     sound: NDArray[np.bool_]  # (n_runs,) False where the run diverged
 
 
@@ -356,53 +355,50 @@ class Paired(NamedTuple):
 
 
 class PairMoments(NamedTuple):
-    """Moments over runs of (S1, N1, S1 - S2, N1 - N2): sums and numbers of steps of two.
+    """Moments over one case's runs of (S1, N1, S1 - S2, N1 - N2): sums and numbers of steps of two.
 
     The differences stand for the second estimator, so that two alike have an error of exactly 0.
     """
 
-    n: float
-    mean: Array  # (4,)
-    products: Array  # (4, 4) sums of products of deviations
+    n: Array  # (...)
+    mean: Array  # (..., 4)
+    products: Array  # (..., 4, 4) sums of products of deviations
 
 
-def pair_moments(first: RunSums, second: RunSums) -> dict[int, PairMoments]:
-    """Moments of a pair by case; a run that diverged under either is left out of both."""
+def pair_moments(first: RunSums, second: RunSums) -> PairMoments:
+    """Moments of a pair; a run that diverged under either is left out of both."""
     both = first.sound & second.sound & (first.numbers > 0) & (second.numbers > 0)
-    found = {}
-    for case in np.unique(first.case[both]).tolist():
-        runs = both & (first.case == case)
-        s, m = first.sums[runs], first.numbers[runs]
-        values = np.stack([s, m, s - second.sums[runs], m - second.numbers[runs]])
-        mean = values.mean(axis=1)
-        deviations = values - mean[:, np.newaxis]
-        found[case] = PairMoments(float(s.size), mean, deviations @ deviations.T)
-    return found
+    counted = both[..., np.newaxis, :]
+    s, m = first.sums, first.numbers
+    with np.errstate(invalid="ignore"):  # of runs that are left out
+        values = np.stack([s, m, s - second.sums, m - second.numbers], axis=-2)
+    n = both.sum(axis=-1).astype(np.float64)
+    mean = np.where(counted, values, 0.0).sum(axis=-1) / np.maximum(n, 1.0)[..., np.newaxis]
+    deviations = np.where(counted, values - mean[..., np.newaxis], 0.0)
+    return PairMoments(n, mean, deviations @ np.swapaxes(deviations, -1, -2))
 
 
-def merge_pairs(a: dict[int, PairMoments], b: dict[int, PairMoments]) -> dict[int, PairMoments]:
-    """Both together, case by case (Chan's merging)."""
-    merged = dict(a)
-    for case, y in b.items():
-        if case in merged:
-            x = merged[case]
-            n, step = x.n + y.n, y.mean - x.mean
-            products = x.products + y.products + x.n * y.n / n * np.outer(step, step)
-            merged[case] = PairMoments(n, x.mean + y.n / n * step, products)
-        else:
-            merged[case] = y
-    return merged
+def merge_pairs(a: PairMoments, b: PairMoments) -> PairMoments:
+    """Both together (Chan's merging)."""
+    n = a.n + b.n
+    share = np.divide(b.n, n, out=np.zeros_like(n), where=n > 0)[..., np.newaxis]
+    step = b.mean - a.mean
+    outer = step[..., :, np.newaxis] * step[..., np.newaxis, :]
+    weight = (a.n[..., np.newaxis] * share)[..., np.newaxis]
+    return PairMoments(n, a.mean + share * step, a.products + b.products + weight * outer)
 
 
-def compare(pairs: Mapping[int, PairMoments], root: bool) -> Paired:
+def compare(cases: Sequence[PairMoments], root: bool) -> Paired:
     """Difference and ratio of a metric over the same runs, with paired standard errors.
 
-    By the delta method; cases are strata.
+    From each case's moments of one pair, without leading axes. By the delta method; cases are
+    strata.
     """
-    n = sum(pair.n for pair in pairs.values())
+    pairs = [pair for pair in cases if pair.n]
+    n = float(sum(pair.n for pair in pairs))
     if n == 0:
         return Paired(math.nan, math.nan, NOTHING, NOTHING)
-    s, m, ds, dm = np.sum([pair.n * pair.mean for pair in pairs.values()], axis=0) / n
+    s, m, ds, dm = np.sum([pair.n * pair.mean for pair in pairs], axis=0) / n
     value_1, slope_1 = _metric(float(s), float(m), root)
     value_2, slope_2 = _metric(float(s - ds), float(m - dm), root)
 
@@ -411,9 +407,10 @@ def compare(pairs: Mapping[int, PairMoments], root: bool) -> Paired:
         one, two = weight_1 * slope_1, weight_2 * slope_2
         coefficients = np.concatenate([one + two, -two])
         variance = 0.0
-        for pair in pairs.values():
+        for pair in pairs:
             spread = max(float(coefficients @ pair.products @ coefficients), 0.0)
-            variance += pair.n * spread / (pair.n - 1) if pair.n > 1 else math.nan
+            runs = float(pair.n)
+            variance += runs * spread / (runs - 1) if runs > 1 else math.nan
         return math.sqrt(variance) / n
 
     difference = Estimate(value_1 - value_2, error(1.0, -1.0), round(n))

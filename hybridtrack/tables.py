@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from rich import box
 from rich.console import Console, RenderableType
 from rich.measure import Measurement
@@ -31,6 +30,8 @@ VERDICT_STYLES = {
     "direction only": "yellow",
     "not reproduced": "yellow",
 }
+
+Rows = list[dict[str, Any]]
 
 
 def figure(value: float, error: float) -> str:
@@ -72,24 +73,26 @@ def show(path: Path, console: Console) -> None:
 def _parts(path: Path) -> Iterator[RenderableType]:
     """What is printed, one below the other. A user's words are Text: nothing in them is markup."""
     manifest = results.require_complete(path)
-    summary = results.read_table(path, "summary")
+    summary = results.read_rows(path, "summary")
     runs, cases = manifest["runs"], manifest["cases"]
     over = f" in each of {cases} cases" if cases > 1 else ""
     yield Text(f"{manifest['title']}: {counted(runs, 'run')}{over}, seed {manifest['seed']}\n")
     yield _summary(summary, manifest["estimators"])
-    comparisons = results.read_table(path, "comparisons")
-    if len(comparisons):
+    comparisons = results.read_rows(path, "comparisons")
+    if comparisons:
         yield ""
         yield _ratios(comparisons, manifest["compare_with"])
     for label, count in manifest.get("diverged", {}).items():
         yield Text(
             f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
         )
-    windows = [w for w in manifest["windows"] if w != "all" and w in set(summary["window"])]
+    windows = [
+        w for w in manifest["windows"] if w != "all" and w in {row["window"] for row in summary}
+    ]
     if windows:
         yield Text(f"windows {', '.join(windows)}: see summary.csv")
-    published = results.read_table(path, "published")
-    if len(published):
+    published = results.read_rows(path, "published")
+    if published:
         yield ""
         yield _published(published)
 
@@ -108,19 +111,19 @@ def _plain_table() -> Table:
     return Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1), show_edge=False)
 
 
-def _summary(summary: pd.DataFrame, estimators: list[str]) -> Table:
+def _summary(summary: Rows, estimators: list[str]) -> Table:
     figures = {
         (row["estimator"], row["metric"]): figure(row["value"], row["standard_error"])
-        for row in summary.to_dict("records")
+        for row in summary
         if row["window"] == "all"
     }
     return _by_metric("estimator", ["raw", *estimators], figures)
 
 
-def _ratios(comparisons: pd.DataFrame, reference: str) -> Table:
+def _ratios(comparisons: Rows, reference: str) -> Table:
     figures = {
         (row["first"], row["metric"]): figure(row["ratio"], row["ratio_standard_error"])
-        for row in comparisons.to_dict("records")
+        for row in comparisons
         if row["window"] == "all"
     }
     return _by_metric(f"ratio to {reference}", list(dict.fromkeys(k[0] for k in figures)), figures)
@@ -139,12 +142,12 @@ def _by_metric(heading: str, labels: list[str], figures: dict[tuple[str, str], s
     return table
 
 
-def _published(published: pd.DataFrame) -> Table:
+def _published(published: Rows) -> Table:
     table = _plain_table()
     table.expand = True
     table.add_column("verdict", width=18, overflow="fold")
     table.add_column("published claim", ratio=1, overflow="fold")
-    for row in published.to_dict("records"):
+    for row in published:
         verdict = Text(row["verdict"], style=VERDICT_STYLES.get(row["verdict"], ""))
         if row["differs"]:
             verdict = Text(f"{row['verdict']} (expected: {row['expected_verdict']})", "bold red")
@@ -157,24 +160,24 @@ def _published(published: pd.DataFrame) -> Table:
 
 def claimed(row: Mapping[Any, Any]) -> str:
     """What was published: a figure, or the sign of a difference."""
-    if math.isnan(row["published"]):
+    if row["published"] is None:
         return "Δ < 0" if row["sign"] == "less" else "Δ > 0"
     return f"{row['published']:g}"
 
 
 def obtained(row: Mapping[Any, Any]) -> str:
     """What we get: the figure, or the paired difference."""
-    difference = "Δ = " if math.isnan(row["published"]) else ""
+    difference = "Δ = " if row["published"] is None else ""
     return difference + figure(row["ours"], row["standard_error"])
 
 
 def surprises(path: Path) -> list[str]:
     """A sentence for every window without a step and every verdict that isn't the expected one."""
-    there = set(results.read_table(path, "summary")["window"])
+    there = {row["window"] for row in results.read_rows(path, "summary")}
     empty = [w for w in results.require_complete(path)["windows"] if w not in there]
     return [f"window '{w}' holds no measured step, so it has no figures" for w in empty] + [
         f"'{row['claim']}' came out as: {row['verdict']}; expected: {row['expected_verdict']}"
-        for row in results.read_table(path, "published").to_dict("records")
+        for row in results.read_rows(path, "published")
         if row["differs"]
     ]
 
@@ -183,7 +186,7 @@ def as_json(path: Path) -> dict[str, Any]:
     """The same for programs; NaN and infinity are null."""
     manifest = results.require_complete(path)
     tables = {
-        name: [_finite(row) for row in results.read_table(path, name).to_dict("records")]
+        name: [_finite(row) for row in results.read_rows(path, name)]
         for name in ("summary", "comparisons", "published")
     }
     return {

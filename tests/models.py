@@ -1,6 +1,7 @@
 """Jump Markov models for tests, small and asymmetric."""
 
 import numpy as np
+import pandas as pd
 
 from hybridtrack.config import load
 from hybridtrack.estimators import Estimates, _bank, _layout
@@ -162,3 +163,8 @@ def scenario(folder, text, *settings):
     file = folder / "scenario.yaml"
     file.write_text(text)
     return load(file, settings)
+
+
+def read_table(folder, name):
+    """A table of a run folder, as a user with pandas has it."""
+    return pd.read_parquet(folder / f"{name}.parquet")

@@ -21,12 +21,10 @@ from hybridtrack.outcomes import paired
 from hybridtrack.results import (
     RunFolder,
     read_manifest,
-    read_table,
     require_complete,
-    run_sums,
 )
 from hybridtrack.statistics import METRICS, RunSums, compare, pair_moments, ratio_of_sums
-from models import RANDOM, SMALL, scenario
+from models import RANDOM, SMALL, read_table, scenario
 
 TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published")
 
@@ -406,7 +404,7 @@ def test_steps_equal_recomputation_from_tracks(tmp_path, text):
 def sums_of(result, label, window, metric):
     sums, numbers = result.sums[label, window, METRICS[metric].quantity]
     sound = result.status[label] == 0
-    return RunSums(np.zeros(sums.size, dtype=np.int64), sums, numbers, sound)
+    return RunSums(sums, numbers, sound)
 
 
 def test_standard_errors_are_the_spread_over_seeds(tmp_path):
@@ -424,7 +422,7 @@ def test_standard_errors_are_the_spread_over_seeds(tmp_path):
                     ratio_of_sums([cell], METRICS[metric].root)[:2]
                 )
         both = [sums_of(result, label, "all", "position_rmse_m") for label in ("IMM", "KF")]
-        pair = compare(pair_moments(*both), True)
+        pair = compare([pair_moments(*both)], True)
         found.setdefault("difference", []).append(pair.difference[:2])
         found.setdefault("ratio", []).append(pair.ratio[:2])
     for name, pairs in found.items():
@@ -485,8 +483,8 @@ def test_a_run_that_diverged_leaves_its_pair_and_is_counted(tmp_path, monkeypatc
     assert n_runs == {"raw": 30, "KF": 30, "MMAE": 30, "IMM": 28, "RMIMM": 30}
     assert summary["value"].max() < 100
     assert set(read_table(folder, "comparisons")["n_pairs"]) == {28}
-    (columns,) = run_sums(folder, "IMM", "all")
-    assert np.flatnonzero(columns["status"]).tolist() == [3, 7]
+    runs = only(read_table(folder, "runs"), estimator="IMM", window="all")
+    assert np.flatnonzero(runs["status"]).tolist() == [3, 7]
 
 
 def test_one_run_has_no_standard_error(tmp_path):

@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import StepPatch
+from PIL import Image
 
 from hybridtrack.errors import UserError
 from hybridtrack.figures import RunInformation, draw, save
@@ -396,14 +398,15 @@ def test_png_has_200_dpi_and_no_text_chunks(tmp_path, flight):
 
 def test_a_figure_that_fails_leaves_the_old_file_and_no_partial_one(tmp_path, monkeypatch):
     figure = Figure()
+    FigureCanvasAgg(figure)
     old = tmp_path / "trajectory.png"
     old.write_bytes(b"old")
 
-    def fail(partial: Path, **settings: object) -> None:
+    def fail(image: Image.Image, partial: Path, **settings: object) -> None:
         partial.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(figure, "savefig", fail)
+    monkeypatch.setattr(Image.Image, "save", fail)
     with pytest.raises(UserError, match=r"cannot be written here \(disk full\)"):
         save({"trajectory": figure}, tmp_path)
     assert list(tmp_path.iterdir()) == [old]

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hybridtrack.columns import as_numpy, names_in
 from hybridtrack.errors import UserError
 from hybridtrack.experiment import is_complete, run
 from hybridtrack.outcomes import paired
@@ -17,11 +18,12 @@ from hybridtrack.results import (
     SCHEMAS,
     RunFolder,
     clear,
+    read_columns,
     read_manifest,
-    read_table,
+    read_rows,
+    read_runs,
     replacing,
     require_complete,
-    run_sums,
     write_text,
 )
 from models import SMALL, scenario
@@ -290,18 +292,21 @@ def test_a_shard_with_other_content_is_one_sentence(damaged, keys):
 def test_another_table_in_its_place_is_one_sentence(damaged, name):
     _, folder = damaged
     pq.write_table(pa.table({"estimator": ["IMM"]}), folder / f"{name}.parquet")
-    with pytest.raises(UserError, match=rf"{name}.parquet: this file is damaged \(not") as caught:
-        read_table(folder, name)
-    sentence(caught)
+    for read in (read_rows, read_columns):
+        with pytest.raises(
+            UserError, match=rf"{name}.parquet: this file is damaged \(not"
+        ) as caught:
+            read(folder, name)
+        sentence(caught)
 
 
 def test_a_part_of_runs_with_other_columns_is_one_sentence(tmp_path):
     names = ["0000-000000-2", "0000-000001-2"]
     with RunFolder(tmp_path / "run", "d1") as folder:
-        folder.save_shard(names[0], {}, cells(0))
-        folder.save_shard(names[1], {}, [table.drop_columns("run") for table in cells(0)])
-        with pytest.raises(UserError, match=r"0001-2.parquet: this file is damaged") as caught:
-            folder.assemble_runs(names, 2)
+        folder.save_shard(names[0], {}, rows(0))
+        folder.save_shard(names[1], {}, rows(0).drop_columns("run"))
+        with pytest.raises(UserError, match=r"0001-2.arrow: this file is damaged") as caught:
+            folder.assemble_runs(names, unseen)
         sentence(caught)
 
 
@@ -321,8 +326,8 @@ def test_truncated_tables_are_one_sentence(damaged, keep):
     for name in ("summary", "runs"):
         cut(folder / f"{name}.parquet", keep)
     for use in (
-        lambda: read_table(folder, "summary"),
-        lambda: next(run_sums(folder, "IMM", "all")),
+        lambda: read_rows(folder, "summary"),
+        lambda: next(read_runs(folder)),
         lambda: paired(folder, "IMM", "KF", "position_rmse_m", "all"),
         lambda: run(experiment, folder, 1, quiet),
     ):
@@ -331,13 +336,13 @@ def test_truncated_tables_are_one_sentence(damaged, keep):
         sentence(caught)
 
 
-def test_a_truncated_part_of_runs_is_one_sentence(tmp_path):
-    cells = [pa.table({"estimator": ["IMM"] * 9, "window": ["all"] * 9})]
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
+def test_a_truncated_part_of_runs_is_one_sentence(tmp_path, keep):
     with RunFolder(tmp_path / "run", "d1") as folder:
-        folder.save_shard("s", {"steps": np.zeros(3)}, cells)
-        cut(tmp_path / "run" / "shards" / "s.parquet", 0.5)
-        with pytest.raises(UserError, match=r"s.parquet: this file is damaged") as caught:
-            folder.assemble_runs(["s"], 1)
+        folder.save_shard("s", {"steps": np.zeros(3)}, rows(0))
+        cut(tmp_path / "run" / "shards" / "s.arrow", keep)
+        with pytest.raises(UserError, match=r"s.arrow: this file is damaged") as caught:
+            folder.assemble_runs(["s"], unseen)
         sentence(caught)
     assert not (tmp_path / "run" / "runs.parquet").exists()
 
@@ -346,7 +351,7 @@ def test_a_missing_table_is_one_sentence(damaged):
     _, folder = damaged
     for name in ("steps", "runs"):
         (folder / f"{name}.parquet").unlink()
-    for use in (lambda: read_table(folder, "steps"), lambda: next(run_sums(folder, "IMM", "all"))):
+    for use in (lambda: read_columns(folder, "steps"), lambda: next(read_runs(folder))):
         with pytest.raises(UserError, match=r"missing from the run folder; .*--force") as caught:
             use()
         sentence(caught)
@@ -364,18 +369,22 @@ def test_lost_runs_are_run_again(damaged):
 # ---- shards ----------------------------------------------------------------------------------
 
 
-def cells(shard, labels=("raw", "IMM")):
-    return [
-        pa.table({"estimator": [label] * 2, "window": ["all"] * 2, "run": [shard, shard + 1]})
-        for label in labels
-    ]
+def rows(first):
+    """Two runs of two estimators."""
+    columns = {"case": ["a"] * 4, "estimator": ["raw", "raw", "IMM", "IMM"], "window": ["all"] * 4}
+    texts = {name: pa.array(column).dictionary_encode() for name, column in columns.items()}
+    return pa.table({**texts, "run": [first, first + 1] * 2})
+
+
+def unseen(runs):
+    """Nobody looks at the runs."""
 
 
 def test_a_shard_comes_back_as_it_was_put_away(tmp_path):
     arrays = {"keys": np.array('{"a": 1}'), "steps": np.array([[np.nan, np.inf, 1e-320]])}
     with RunFolder(tmp_path / "run", "d1") as folder:
         assert not folder.has_shard("0")
-        folder.save_shard("0", arrays, cells(0))
+        folder.save_shard("0", arrays, rows(0))
         assert folder.has_shard("0")
         loaded = folder.load_shard("0", dict)
     assert str(loaded["keys"]) == '{"a": 1}'
@@ -385,23 +394,26 @@ def test_a_shard_comes_back_as_it_was_put_away(tmp_path):
 def test_runs_are_assembled_in_the_order_asked_for_from_old_and_new(tmp_path):
     runs = tmp_path / "run" / "runs.parquet"
     zero, five, ten = "0000-000000-2", "0000-000005-2", "0000-000010-2"
+    seen = []
     with RunFolder(tmp_path / "run", "d1") as folder:
         for name, number in ((zero, 0), (ten, 10)):
-            folder.save_shard(name, {"a": np.zeros(1)}, cells(number))
-        folder.assemble_runs([zero, ten], 2)
+            folder.save_shard(name, {"a": np.zeros(1)}, rows(number))
+        folder.assemble_runs([zero, ten], seen.append)
         assert not runs.exists()
         folder.publish({"digest": "d1"})
         folder.drop_parts([zero, ten])
     assert pq.read_table(runs)["run"].to_pylist() == [0, 1, 0, 1, 10, 11, 10, 11]
     with RunFolder(tmp_path / "run", "d1") as folder:
         assert folder.has_shard(ten)
-        folder.save_shard(five, {"a": np.zeros(1)}, cells(5))
-        folder.assemble_runs([five, ten], 2)
+        folder.save_shard(five, {"a": np.zeros(1)}, rows(5))
+        folder.assemble_runs([five, ten], seen.append)
         folder.publish({"digest": "d1"})
         folder.drop_parts([five, ten])
     table = pq.read_table(runs)
     assert table["run"].to_pylist() == [5, 6, 5, 6, 10, 11, 10, 11]
     assert table["estimator"].to_pylist() == ["raw", "raw", "IMM", "IMM"] * 2
+    assert table.schema.field("estimator").type == pa.string()  # not our dictionary
+    assert seen == [rows(first) for first in (0, 10, 5, 10)]
     assert not (tmp_path / "run" / "unfinished").exists()
 
 
@@ -411,12 +423,12 @@ def test_shards_that_have_grown_are_dropped_and_longer_ones_are_kept(tmp_path):
     shards = tmp_path / "run" / "shards"
     with RunFolder(tmp_path / "run", "d1") as folder:
         for name in (grown, held, beyond, own, longer):
-            folder.save_shard(name, {}, cells(0))
+            folder.save_shard(name, {}, rows(0))
         (shards / "folder.npz").mkdir()
         (shards / "mine.npz").touch()
         folder.drop_parts([held, own])
     kept = {f"{held}.npz", f"{own}.npz"}  # their runs are in runs.parquet
-    kept |= {f"{name}.{suffix}" for name in (beyond, longer) for suffix in ("npz", "parquet")}
+    kept |= {f"{name}.{suffix}" for name in (beyond, longer) for suffix in ("npz", "arrow")}
     assert {path.name for path in shards.iterdir()} == kept | {"folder.npz", "mine.npz"}
 
 
@@ -437,7 +449,7 @@ def test_tables_stay_as_they_are_until_they_are_published(tmp_path):
         assert (run_folder / "published.parquet").read_bytes() == before
         folder.write_table("published", row)
         folder.publish(manifest)
-    assert len(read_table(run_folder, "published")) == 1
+    assert read_rows(run_folder, "published") == [dict.fromkeys(names)]
     assert read_manifest(run_folder) == manifest | {"status": "complete"}
 
 
@@ -457,33 +469,36 @@ def test_require_complete(finished, tmp_path):
     assert read_manifest(tmp_path / "nothing") is None
 
 
-def test_run_sums_are_the_rows_of_one_estimator_and_window(finished):
+def test_runs_come_back_by_estimator_window_and_run(finished):
     experiment, folder = finished
+    (runs,) = read_runs(folder)  # five runs: one shard
     table = pd.read_parquet(folder / "runs.parquet")
-    for label in ("raw", "IMM", "RMIMM"):
-        for window in experiment.windows:
-            (columns,) = run_sums(folder, label, window.name)  # five runs: one shard
-            mine = table[(table["estimator"] == label) & (table["window"] == window.name)]
-            assert len(mine) == experiment.runs
-            assert {"case_number", "status"} < columns.keys()
-            for name, values in columns.items():
-                np.testing.assert_array_equal(values, mine[name])
+    labels, windows = names_in(runs["estimator"]), names_in(runs["window"])
+    assert labels == ["raw", *(chosen.label for chosen in experiment.estimators)]
+    assert windows == [window.name for window in experiment.windows]
+    expected = [(e, w, r) for e in labels for w in windows for r in range(experiment.runs)]
+    assert list(table[["estimator", "window", "run"]].itertuples(index=False)) == expected
+    for name in table.columns.drop(["case", "estimator", "window"]):
+        np.testing.assert_array_equal(as_numpy(runs[name]), table[name])
 
 
 @pytest.mark.parametrize(("estimator", "window"), [("XYZ", "all"), ("IMM", "xyz")])
-def test_run_sums_that_are_not_there_are_one_sentence(finished, estimator, window):
+def test_a_pair_that_is_not_there_is_one_sentence(finished, estimator, window):
     with pytest.raises(UserError, match="holds no estimator") as caught:
-        next(run_sums(finished[1], estimator, window))
+        paired(finished[1], "KF", estimator, "position_rmse_m", window)
     assert estimator in sentence(caught)
     assert window in sentence(caught)
 
 
-def test_tables_have_their_schema_even_when_empty(tmp_path):
-    names = SCHEMAS["published"].names
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_tables_have_their_schema_even_when_empty(tmp_path, name):
     with RunFolder(tmp_path / "run", "d1") as folder:
-        folder.write_table("published", {name: [] for name in names})
+        folder.write_table(name, {field.name: [] for field in SCHEMAS[name]})
         folder.publish({"digest": "d1"})
-    table = read_table(tmp_path / "run", "published")
-    assert list(table.columns) == names
-    assert table.empty
-    assert table["ours"].dtype == np.float64
+    assert pq.read_schema(tmp_path / "run" / f"{name}.parquet").equals(SCHEMAS[name])
+    assert read_rows(tmp_path / "run", name) == []
+    if name in ("steps", "tracks"):
+        table = read_columns(tmp_path / "run", name)
+        assert list(table) == SCHEMAS[name].names
+        assert {len(column) for column in table.values()} == {0}
+        assert table["value"].dtype == np.float64

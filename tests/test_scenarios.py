@@ -5,6 +5,7 @@ import pytest
 
 from hybridtrack import config, experiment, outcomes, results
 from hybridtrack.models import Mode
+from models import read_table
 
 
 def quiet(done, total):
@@ -25,7 +26,7 @@ def test_every_scenario_runs_and_every_verdict_is_the_expected_one(name, tmp_pat
     shipped = config.load(name)
     experiment.run(shipped, tmp_path / name, 2, quiet)
     assert results.require_complete(tmp_path / name)["diverged"] == {}
-    for row in results.read_table(tmp_path / name, "published").to_dict("records"):
+    for row in results.read_rows(tmp_path / name, "published"):
         assert row["verdict"] == row["expected_verdict"], row
 
 
@@ -50,12 +51,12 @@ def test_two_models_beat_one_on_the_recorded_flight(flight):
 def test_no_other_single_filter_does_better(flight, tmp_path):
     """The Kalman filter compared with has the best psd of 1, 3, 10 and 30 m^2/s^3."""
     _, path = flight
-    summary = results.read_table(path, "summary").set_index(["estimator", "metric", "window"])
+    summary = read_table(path, "summary").set_index(["estimator", "metric", "window"])
     best = summary.loc[("KF", "position_rmse_m", "all"), "value"]
     for psd in (1, 3, 10):
         other = config.load("recorded_flight", [f"modes.any.acceleration_psd_m2_s3={psd}"])
         experiment.run(other, tmp_path / str(psd), 2, quiet)
-        table = results.read_table(tmp_path / str(psd), "summary")
+        table = read_table(tmp_path / str(psd), "summary")
         table = table.set_index(["estimator", "metric", "window"])
         assert table.loc[("KF", "position_rmse_m", "all"), "value"] > best
 
@@ -77,7 +78,7 @@ def test_uneven_times_taken_as_even_are_visibly_worse(tmp_path):
     ):
         changed = shipped._replace(cases=(case._replace(times_s=used_s, truth=truth),))
         experiment.run(changed, tmp_path / name, 2, quiet)
-        table = results.read_table(tmp_path / name, "summary")
+        table = read_table(tmp_path / name, "summary")
         row = table[(table.estimator == "IMM") & (table.metric == "position_rmse_m")].iloc[0]
         position_rmse_m[name] = row["value"], row["standard_error"]
     (uneven, error), (even, other) = position_rmse_m["as they are"], position_rmse_m["even"]
@@ -111,5 +112,5 @@ def test_every_estimator_runs_in_a_scenario(tmp_path):
     assert all(isinstance(mode, Mode) for mode in loaded.bank.modes)
     experiment.run(loaded, tmp_path / "run", 1, quiet)
     assert results.require_complete(tmp_path / "run")["diverged"] == {}
-    summary = results.read_table(tmp_path / "run", "summary")
+    summary = read_table(tmp_path / "run", "summary")
     assert set(summary.estimator) == {"raw", *(f"E_{name}" for name in estimators())}

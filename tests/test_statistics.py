@@ -1,6 +1,8 @@
 """Scores against plain loops, merged moments against direct ones, errors against resampling."""
 
+import functools
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from hybridtrack.statistics import (
     advantage_kept,
     compare,
     merge_moments,
+    merge_pairs,
     merge_sum_moments,
     pair_moments,
     ratio_of_sums,
@@ -496,8 +499,21 @@ def test_ratios_that_are_not_there():
 # ---- pairs -----------------------------------------------------------------------------------
 
 
+class Runs(NamedTuple):
+    """An estimator's sums over the runs of several cases."""
+
+    case: np.ndarray
+    sums: np.ndarray
+    numbers: np.ndarray
+    sound: np.ndarray
+
+
 def compared(first, second, root):
-    return compare(pair_moments(first, second), root)
+    cases = []
+    for c in np.unique(first.case):
+        pair = (RunSums(*(a[r.case == c] for a in r[1:])) for r in (first, second))
+        cases.append(pair_moments(*pair))
+    return compare(cases, root)
 
 
 def pair(rng, sizes):
@@ -510,7 +526,7 @@ def pair(rng, sizes):
     first, second = (
         numbers * shared * factor * rng.gamma(60.0, 1 / 60.0, n) for factor in (0.9, 1)
     )
-    return RunSums(case, first, numbers, everyone), RunSums(case, second, numbers, everyone)
+    return Runs(case, first, numbers, everyone), Runs(case, second, numbers, everyone)
 
 
 def bootstrapped(first, second, root, rng, resamples=4000):
@@ -584,8 +600,8 @@ def test_a_pair_in_a_hand_case():
     # deviation sqrt(3), so the error 1; the residuals of the ratio 2, first - 2 second, are
     # 0, -2, 2 with the deviation 2, so its error is 2 / sqrt(3) over the mean of the second, 2.
     case, numbers, sound = np.zeros(3, dtype=np.int64), np.ones(3), np.ones(3, dtype=bool)
-    first = RunSums(case, np.array([2.0, 4.0, 6.0]), numbers, sound)
-    second = RunSums(case, np.array([1.0, 3.0, 2.0]), numbers, sound)
+    first = Runs(case, np.array([2.0, 4.0, 6.0]), numbers, sound)
+    second = Runs(case, np.array([1.0, 3.0, 2.0]), numbers, sound)
     ours = compared(first, second, root=False)
     assert ours.difference == (2.0, pytest.approx(1.0, rel=ROUNDING), 3)
     assert ours.ratio == (2.0, pytest.approx(1 / math.sqrt(3), rel=ROUNDING), 3)
@@ -605,14 +621,8 @@ def test_a_run_that_diverged_under_either_leaves_both():
         second._replace(sums=spoiled_2, numbers=no_steps, sound=np.isfinite(spoiled_2)),
         root=True,
     )
-    expected = compared(
-        *(
-            RunSums(r.case[kept], r.sums[kept], r.numbers[kept], r.sound[kept])
-            for r in (first, second)
-        ),
-        root=True,
-    )
-    assert ours == expected
+    expected = compared(*(Runs(*(array[kept] for array in r)) for r in (first, second)), root=True)
+    np.testing.assert_allclose(np.hstack(ours), np.hstack(expected), rtol=1e-12)  # sums' order
     assert ours.difference.n_runs == 36
 
 
@@ -632,6 +642,26 @@ def test_pairs_that_are_not_there():
     flawless = compared(first, second._replace(sums=np.zeros(5)), root=True)
     assert flawless.difference.value == flawless.first
     assert math.isnan(flawless.ratio.value)
-    lonely = compared(*(RunSums(*(field[:1] for field in r)) for r in (first, second)), root=True)
+    lonely = compared(*(Runs(*(field[:1] for field in r)) for r in (first, second)), root=True)
     assert lonely.difference.n_runs == 1
     assert math.isnan(lonely.difference.standard_error)
+
+
+def test_pairs_merge_along_all_their_axes():
+    """Two parts of the runs, and quantities one of which is nowhere defined."""
+    one, two = pair(np.random.default_rng(21), (90,))
+    factors = np.array([1.0, 3.0, np.nan])[:, np.newaxis]
+
+    def part(runs, which):
+        numbers = np.where(np.isnan(factors), 0.0, runs.numbers[which])
+        return RunSums(factors * runs.sums[which], numbers, runs.sound[which])
+
+    parts = [
+        pair_moments(part(one, which), part(two, which))
+        for which in (slice(0, 50), slice(50, 90), slice(0, 0))
+    ]
+    merged = functools.reduce(merge_pairs, parts)
+    whole = pair_moments(part(one, slice(None)), part(two, slice(None)))
+    assert merged.n.tolist() == whole.n.tolist() == [90, 90, 0]
+    for ours, expected in zip(merged, whole, strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-9)  # differences of like numbers

@@ -4,16 +4,20 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 from hybridtrack.statistics import NOTHING, Estimate, Paired
 from hybridtrack.verdicts import (
     ASSUMED,
     DIRECTION,
+    FEW_RUNS,
     NO_DATA,
     NOT_REPRODUCED,
+    ONE_SIDED,
     REPRODUCED,
     UNDECIDED,
     Claim,
+    _student,
     judge_comparison,
     judge_figure,
     printed_tolerance,
@@ -201,3 +205,9 @@ def test_few_runs_dont_cry_wolf(n_runs):
     allowed = share + 4.0 * math.sqrt(share / repetitions)
     assert figures / repetitions <= allowed
     assert signs / repetitions <= allowed
+
+
+@pytest.mark.parametrize("freedom", [1, 30, FEW_RUNS - 1, FEW_RUNS, 1000, 10**6])
+def test_the_error_allowed_is_students(freedom):
+    expected = -stdtrit(freedom, ONE_SIDED)
+    assert _student(freedom) == pytest.approx(expected, rel=1e-11)

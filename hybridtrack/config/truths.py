@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridtrack.config import banks, checks, recorded, starts
+from hybridtrack.config import banks, checks, starts
 from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import FileForm, RecordingForm, ScenarioForm, TruthForm
 from hybridtrack.config.validate import as_written
@@ -27,6 +27,8 @@ def cases(
     if truth.start is not None and truth.legs is None:
         raise document.error(("truth", "start"), "'start' belongs to 'legs', which aren't given")
     if truth.recording is not None:
+        from hybridtrack.config import recorded  # pandas, which nothing else needs
+
         if form.clock is not None:
             raise document.error(
                 ("clock",), "a recording has times of its own; remove 'clock' (see thin_to_s)"

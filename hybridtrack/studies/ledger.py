@@ -16,7 +16,7 @@ def markdown(folders: Sequence[Path]) -> str:
     lines = [HEADER]
     for folder in folders:
         name = results.require_complete(folder)["name"]
-        for row in results.read_table(folder, "published").to_dict("records"):
+        for row in results.read_rows(folder, "published"):
             because = f": {row['because']}" if row["because"] else ""
             cells = (
                 name,
