@@ -120,6 +120,8 @@ class ModeBank(NamedTuple):
     def _transition(self, steps_s: Array) -> Array:
         if self.generator_per_s is not None:
             generator = self.generator_per_s
+            if not generator.any():  # a Kalman filter's, which shouldn't have to wait for scipy
+                return np.repeat(np.eye(len(generator))[np.newaxis], steps_s.size, axis=0)
             return np.stack([_matrix_exponential(generator.tobytes(), s) for s in steps_s.tolist()])
         assert self.transition_matrix is not None
         if steps_s.size > 1:
