@@ -173,6 +173,12 @@ class Scans(NamedTuple):
     truth: TruthSpan
     measurements: Array  # (n_steps, n_y, lanes), NaN where missed
 
+    def after(self, steps: int) -> "Scans":
+        """Without the first steps."""
+        state, mode, since_switch_s = self.truth
+        truth = TruthSpan(state[steps:], mode[steps:], since_switch_s[steps:])
+        return Scans(truth, self.measurements[steps:])
+
 
 class Case(NamedTuple):
     """One truth with its own times; an experiment has one or more."""

@@ -1,0 +1,426 @@
+"""Estimates scored span by span: each quantity of a run and step, tallied while it is in the cache.
+
+One compiled pass goes over the steps of a span. At each it fills a *sheet*, a row of lanes per
+quantity, and adds the rows to the moments of that step and to every run's sums over the windows
+that hold it. A new quantity is a metric in `statistics.METRICS` and, here, its row's name, the
+condition under which it exists (in `defined`) and a formula (in `fill_sheet`).
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridtrack.compiled import lane_kernel, row_kernel
+from hybridtrack.estimators import Estimates
+from hybridtrack.models import Array
+from hybridtrack.simulation import Scans
+from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES, Moments
+
+ROUNDING = 1e-9  # likelihoods sum to 1; two filters that are one in theory differ by less
+
+POSITION_ROW = QUANTITIES.index(POSITION)
+AT_SCANS_ROW = QUANTITIES.index(POSITION_AT_SCANS)
+VELOCITY_ROW = QUANTITIES.index("velocity_squared_error_m2_s2")
+CORRECT_ROW = QUANTITIES.index("mode_correct")
+BRIER_ROW = QUANTITIES.index("mode_brier")
+TRUE_MODE_ROW = QUANTITIES.index("true_mode_probability")
+DISTINCTNESS_ROW = QUANTITIES.index("likelihood_distinctness")
+KEPT = "likelihood_advantage_kept"
+KEPT_ROW = QUANTITIES.index(KEPT)
+
+Integers = NDArray[np.int64]
+
+
+class Names(NamedTuple):
+    """Names that tell which quantities exist."""
+
+    truth_states: tuple[str, ...]
+    truth_modes: tuple[str, ...]  # () where the truth has none
+    states: tuple[str, ...]  # the estimator's
+    modes: tuple[str, ...]  # the estimator's; one mode has no probabilities to score
+
+    def axes(self, kind: str) -> Integers:
+        """Where truth and estimate have the vector's common axes (n, 2); kind '' or 'v'."""
+        both = [kind + a for a in "xyz" if {kind + a} <= {*self.truth_states} & {*self.states}]
+        found = [(self.truth_states.index(name), self.states.index(name)) for name in both]
+        return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+    def true_mode(self) -> Integers:
+        """The estimator's index of each mode of the truth; -1 where it has none, and at the end."""
+        table = [self.modes.index(n) if n in self.modes else -1 for n in self.truth_modes]
+        return np.array([*table, -1], dtype=np.int64)  # the truth's -1, no mode, finds the last
+
+
+def defined(names: Names, *, likelihoods: bool, compared: bool) -> tuple[str, ...]:
+    """The quantities that exist, in the order in which they are tallied.
+
+    likelihoods: the estimator gives its modes' likelihoods; compared: so does `compare_with`.
+    """
+    modes = len(names.modes) > 1
+    common = modes and bool({*names.truth_modes} & {*names.modes})
+    position = bool(len(names.axes("")))
+    exists = {
+        POSITION: position,
+        "velocity_squared_error_m2_s2": bool(len(names.axes("v"))),
+        POSITION_AT_SCANS: position,
+        "likelihood_distinctness": modes and likelihoods,
+        "mode_correct": common,
+        "mode_brier": common,
+        "true_mode_probability": common,
+        KEPT: common and likelihoods and compared,
+    }
+    return tuple(quantity for quantity in exists if exists[quantity])
+
+
+class Layout(NamedTuple):
+    """What the kernel has to know of the names."""
+
+    tallied: Integers  # (n_tallied,) rows of the sheet
+    position: Integers  # (n_axes, 2) the truth's state, the estimate's
+    velocity: Integers  # (n_axes, 2)
+    true_mode: Integers  # (n_truth_modes + 1,) the estimator's mode by the truth's; -1 for none
+    modes: int  # how many modes are scored; 0 where there is but one
+    likelihoods: bool  # whether the estimates hold them
+    leads: bool  # whether the others' advantage is compared with this one's
+
+
+class Sheet(NamedTuple):
+    """One step of one estimator; scratch memory, overwritten from step to step."""
+
+    rows: Array  # (n_quantities, lanes) in the order of QUANTITIES
+    scratch: Array  # (4, lanes)
+    true_mode: Integers  # (lanes,) as the estimator counts them
+    leading: Array  # (n_steps, lanes) likelihood advantage under `compare_with`, for a whole span
+
+
+def blank_sheet(span_steps: int, lanes: int) -> Sheet:
+    """A sheet for all estimators of a block."""
+    return Sheet(
+        rows=np.full((len(QUANTITIES), lanes), np.nan),
+        scratch=np.full((4, lanes), np.nan),
+        true_mode=np.full(lanes, -1, dtype=np.int64),
+        leading=np.full((span_steps, lanes), np.nan),
+    )
+
+
+class Totals(NamedTuple):
+    """What the rows add up to; first the tallied quantities, then series over steps alone."""
+
+    n: Array  # (n_series, n_steps)
+    mean: Array  # (n_series, n_steps)
+    squares: Array  # (n_series, n_steps)
+    sums: Array  # (n_tallied, n_windows, lanes)
+    numbers: Array  # (n_tallied, n_windows, lanes) steps counted run by run
+    common: Array  # (n_tallied, n_windows) steps counted for all runs at once
+
+
+def as_measured(measurements: Array) -> Estimates:
+    """The measurements themselves as an estimator's: a mean of positions, and nothing else."""
+    nothing = np.empty((0, 0, measurements.shape[2]))
+    return Estimates(measurements, nothing, nothing, nothing)
+
+
+# ---- the formulas ----------------------------------------------------------------------------
+
+
+@row_kernel
+def add_squared_difference(out, truth, row):
+    """truth (lanes,), or (1,) where all runs have one. Infinite estimates count as NaN."""
+    if truth.size == 1:
+        for b in range(out.size):
+            d = row[b] - truth[0]
+            out[b] += d * d if abs(d) < np.inf else np.nan
+    else:
+        for b in range(out.size):
+            d = row[b] - truth[b]
+            out[b] += d * d if abs(d) < np.inf else np.nan
+
+
+@lane_kernel
+def squared_error(out, axes, truth, estimate):
+    """Squared norm of the vector error; NaN where the estimate isn't finite."""
+    for b in range(out.size):
+        out[b] = 0.0
+    for n in range(axes.shape[0]):
+        add_squared_difference(out, truth[axes[n, 0]], estimate[axes[n, 1]])
+
+
+@row_kernel
+def leave_out_missed(row, measurement):
+    """NaN where a measurement, or a component of it, is missing."""
+    for m in range(measurement.shape[0]):
+        for b in range(row.size):
+            row[b] = row[b] if measurement[m, b] == measurement[m, b] else np.nan
+
+
+@lane_kernel
+def find_true_mode(out, table, mode):
+    """out <- table[mode]; mode (lanes,), or (1,) where all runs have one."""
+    if mode.size == 1:
+        for b in range(out.size):
+            out[b] = table[mode[0]]
+    else:
+        for b in range(out.size):
+            out[b] = table[mode[b]]
+
+
+@lane_kernel
+def score_modes(correct, brier, own, probabilities, true_mode, largest):
+    """Accuracy (0 or 1; the first of equals wins), Brier score, probability of the true mode.
+
+    All NaN where the true mode is unknown or a probability is NaN.
+    """
+    lanes = own.size
+    for b in range(lanes):
+        largest[b] = -np.inf
+        brier[b] = 0.0
+        own[b] = np.nan
+    for i in range(probabilities.shape[0]):
+        for b in range(lanes):
+            p = probabilities[i, b]
+            here = true_mode[b] == i
+            d = p - (1.0 if here else 0.0)
+            brier[b] += 0.5 * d * d
+            own[b] = p if here else own[b]
+            larger = p > largest[b]
+            correct[b] = (1.0 if here else 0.0) if larger else correct[b]
+            largest[b] = p if larger else largest[b]
+    for b in range(lanes):
+        known = (true_mode[b] >= 0) & (brier[b] == brier[b])
+        correct[b] = correct[b] if known else np.nan
+        brier[b] = brier[b] if known else np.nan
+        own[b] = own[b] if known else np.nan
+
+
+@lane_kernel
+def score_likelihoods(distinctness, advantage, likelihoods, true_mode, scratch):
+    """Gap between the two largest; the true mode's lead over the best of the others."""
+    lanes = distinctness.size
+    first, second, others = scratch[0], scratch[1], scratch[2]
+    for b in range(lanes):
+        first[b] = second[b] = others[b] = -np.inf
+        advantage[b] = np.nan
+    for i in range(likelihoods.shape[0]):
+        for b in range(lanes):
+            value = likelihoods[i, b]
+            here = true_mode[b] == i
+            beaten = value if value > second[b] else second[b]
+            second[b] = first[b] if value > first[b] else beaten
+            first[b] = value if value > first[b] else first[b]
+            advantage[b] = value if here else advantage[b]
+            others[b] = value if (not here) & (value > others[b]) else others[b]
+    for b in range(lanes):
+        distinctness[b] = first[b] - second[b]
+        advantage[b] -= others[b]
+
+
+@lane_kernel
+def compare_advantages(kept, own, leading):
+    """1 where the true mode leads by as much as under the leading estimator, or more; else 0."""
+    for b in range(kept.size):
+        known = (own[b] == own[b]) & (leading[b] == leading[b])
+        enough = 1.0 if own[b] >= leading[b] - ROUNDING else 0.0
+        kept[b] = enough if known else np.nan
+
+
+@lane_kernel
+def fill_sheet(sheet, layout, k, scans, estimates):
+    """Every quantity of step k of a span; what isn't defined is left as it is."""
+    rows, truth, measurement = sheet.rows, scans.truth, scans.measurements[k]
+    if layout.position.shape[0]:
+        squared_error(rows[POSITION_ROW], layout.position, truth.state[k], estimates.mean[k])
+        for b in range(rows.shape[1]):
+            rows[AT_SCANS_ROW, b] = rows[POSITION_ROW, b]
+        leave_out_missed(rows[AT_SCANS_ROW], measurement)
+    if layout.velocity.shape[0]:
+        squared_error(rows[VELOCITY_ROW], layout.velocity, truth.state[k], estimates.mean[k])
+    if layout.modes:
+        find_true_mode(sheet.true_mode, layout.true_mode, truth.mode[k])
+        score_modes(
+            rows[CORRECT_ROW],
+            rows[BRIER_ROW],
+            rows[TRUE_MODE_ROW],
+            estimates.mode_probabilities[k],
+            sheet.true_mode,
+            sheet.scratch[0],
+        )
+        if layout.likelihoods:
+            advantage = sheet.scratch[3]
+            likelihoods = estimates.mode_likelihoods[k]
+            distinctness = rows[DISTINCTNESS_ROW]
+            score_likelihoods(distinctness, advantage, likelihoods, sheet.true_mode, sheet.scratch)
+            leave_out_missed(distinctness, measurement)
+            leave_out_missed(advantage, measurement)
+            for b in range(advantage.size):
+                known = rows[TRUE_MODE_ROW, b] == rows[TRUE_MODE_ROW, b]
+                advantage[b] = advantage[b] if known else np.nan
+            if layout.leads:
+                for b in range(advantage.size):
+                    sheet.leading[k, b] = advantage[b]
+            compare_advantages(rows[KEPT_ROW], advantage, sheet.leading[k])
+
+
+# ---- the tally -------------------------------------------------------------------------------
+
+
+@lane_kernel
+def add_to_step(row, runs, totals, i, step):
+    """Note the moments of a row's first runs, NaN left out; true where all of them are finite."""
+    total = 0.0
+    for b in range(runs):
+        total += row[b]
+    finite = abs(total) < np.inf
+    deviation = 0.0
+    if finite:  # nearly always: NaN and infinity would have spoilt the sum
+        n = float(runs)
+        centre = total / n
+        for b in range(runs):
+            d = row[b] - centre
+            deviation += d * d
+    else:
+        n = 0.0
+        total = 0.0
+        for b in range(runs):
+            present = row[b] == row[b]
+            n += 1.0 if present else 0.0
+            total += row[b] if present else 0.0
+        centre = total / n if n > 0.0 else 0.0
+        for b in range(runs):
+            d = row[b] - centre if row[b] == row[b] else 0.0
+            deviation += d * d
+    totals.n[i, step] = n
+    totals.mean[i, step] = centre
+    totals.squares[i, step] = deviation
+    return finite
+
+
+@lane_kernel
+def add_to_windows(row, finite, held, sums, numbers, common):
+    """Add a row to the sums of the windows that hold its step, NaN left out.
+
+    held (n_windows, lanes), or (n_windows, 1) where all runs have the same windows.
+    """
+    for w in range(held.shape[0]):
+        if held.shape[1] > 1:
+            for b in range(row.size):
+                present = held[w, b] & (row[b] == row[b])
+                sums[w, b] += row[b] if present else 0.0
+                numbers[w, b] += 1.0 if present else 0.0
+        elif held[w, 0] and finite:
+            common[w] += 1.0
+            for b in range(row.size):
+                sums[w, b] += row[b]
+        elif held[w, 0]:
+            for b in range(row.size):
+                present = row[b] == row[b]
+                sums[w, b] += row[b] if present else 0.0
+                numbers[w, b] += 1.0 if present else 0.0
+
+
+@lane_kernel
+def tally(totals, sheet, layout, step, runs, scans, held, estimates):
+    """Score a span that begins at `step` and add it to the totals."""
+    n_tallied = layout.tallied.size
+    for k in range(estimates.mean.shape[0]):
+        fill_sheet(sheet, layout, k, scans, estimates)
+        for i in range(n_tallied):
+            row = sheet.rows[layout.tallied[i]]
+            finite = add_to_step(row, runs, totals, i, step + k)
+            add_to_windows(
+                row, finite, held[k], totals.sums[i], totals.numbers[i], totals.common[i]
+            )
+        i = n_tallied
+        for j in range(layout.modes):
+            add_to_step(estimates.mode_probabilities[k, j], runs, totals, i, step + k)
+            i += 1
+            if layout.likelihoods:
+                likelihood = sheet.scratch[0]
+                for b in range(likelihood.size):
+                    likelihood[b] = estimates.mode_likelihoods[k, j, b]
+                leave_out_missed(likelihood, scans.measurements[k])
+                add_to_step(likelihood, runs, totals, i, step + k)
+                i += 1
+
+
+@lane_kernel
+def all_below(values, limit):
+    """Whether every |value| of (n_steps, n, lanes) is below the limit, which NaN isn't."""
+    beyond = 0
+    for k in range(values.shape[0]):
+        for e in range(values.shape[1]):
+            for b in range(values.shape[2]):
+                beyond += 0 if abs(values[k, e, b]) < limit else 1
+    return beyond == 0
+
+
+class Tally:
+    """One estimator's scores over one block of runs."""
+
+    def __init__(
+        self,
+        names: Names,
+        n_steps: int,
+        windows: tuple[str, ...],
+        sheet: Sheet,
+        runs: int,
+        *,
+        likelihoods: bool = False,
+        leads: bool = False,
+        compared: bool = False,
+    ) -> None:
+        """The sheet may be shared; runs: how many of its lanes count.
+
+        likelihoods: the estimates hold them; leads: `compare_with` names this estimator, which
+        then is tallied before the others; compared: this one or a leading one has an advantage.
+        """
+        self._quantities = defined(names, likelihoods=likelihoods, compared=leads or compared)
+        self._windows = windows
+        self._series = list(self._quantities)
+        modes = names.modes if len(names.modes) > 1 else ()
+        for mode in modes:
+            self._series.append(f"mode_probability:{mode}")
+            if likelihoods:
+                self._series.append(f"mode_likelihood:{mode}")
+        self._sheet = sheet
+        self._runs = runs
+        self.has_advantage = KEPT in self._quantities
+        self._layout = Layout(
+            tallied=np.array([QUANTITIES.index(q) for q in self._quantities], dtype=np.int64),
+            position=names.axes(""),
+            velocity=names.axes("v"),
+            true_mode=names.true_mode(),
+            modes=len(modes),
+            likelihoods=likelihoods,
+            leads=leads,
+        )
+        series, cells = (len(self._series), n_steps), (len(self._quantities), len(windows))
+        lanes = sheet.rows.shape[1]
+        self._totals = Totals(
+            n=np.zeros(series),
+            mean=np.zeros(series),
+            squares=np.zeros(series),
+            sums=np.zeros((*cells, lanes)),
+            numbers=np.zeros((*cells, lanes)),
+            common=np.zeros(cells),
+        )
+
+    def add(self, step: int, scans: Scans, held: NDArray[np.bool_], estimates: Estimates) -> None:
+        """Score a span that begins at `step`; held (n_steps, n_windows, lanes or 1)."""
+        tally(self._totals, self._sheet, self._layout, step, self._runs, scans, held, estimates)
+
+    def steps(self) -> Iterator[tuple[str, Moments]]:
+        """Each quantity's moments at every step (n_steps,)."""
+        for i, name in enumerate(self._series):
+            if name != POSITION_AT_SCANS:
+                totals = self._totals
+                yield name, Moments(totals.n[i], totals.mean[i], totals.squares[i])
+
+    def sums(self) -> Iterator[tuple[tuple[str, str], tuple[Array, Array]]]:
+        """By window and quantity, the runs' sums (runs,) and how many steps each has."""
+        sums = self._totals.sums[..., : self._runs].copy()
+        numbers = self._totals.numbers[..., : self._runs] + self._totals.common[..., np.newaxis]
+        for i, quantity in enumerate(self._quantities):
+            for w, window in enumerate(self._windows):
+                yield (window, quantity), (sums[i, w], numbers[i, w])
