@@ -32,7 +32,7 @@ from hybridtrack.statistics import (
     sum_moments,
 )
 
-SPAN_STEPS = 32  # steps between two looks at Python: their arrays stay in the cache
+SPAN_STEPS = 50  # at most, between two looks at Python: their arrays stay in the cache
 LANE_GROUP = 32  # lanes are filtered in whole groups, so that each takes the same instructions
 DIVERGED = 1e60  # an estimate beyond this has no use, and its fourth power must stay finite
 
@@ -103,7 +103,7 @@ def _merged(a: dict[Key, M], b: dict[Key, M], merge_all: Callable[[M, M], M]) ->
     kind = type(next(iter(a.values())))
     together = (np.array([group[key] for key in a]) for group in (a, b))
     merged = merge_all(*(kind(*np.moveaxis(fields, 1, 0)) for fields in together))
-    return {key: kind(*fields) for key, fields in zip(a, np.stack(merged, axis=1), strict=True)}
+    return dict(zip(a, map(kind, *merged), strict=True))
 
 
 def summarise(result: BlockResult) -> GroupStatistics:
@@ -113,8 +113,7 @@ def summarise(result: BlockResult) -> GroupStatistics:
         sums, numbers = (np.array([pair[i] for pair in result.sums.values()]) for i in (0, 1))
         sound = {label: status == 0 for label, status in result.status.items()}
         moments = sum_moments(sums, numbers, np.array([sound[cell[0]] for cell in result.sums]))
-        for cell, fields in zip(result.sums, np.stack(moments, axis=1), strict=True):
-            windows[cell] = SumMoments(*fields)
+        windows = dict(zip(result.sums, map(SumMoments, *moments), strict=True))
     diverged = {label: int((status > 0).sum()) for label, status in result.status.items()}
     return GroupStatistics(result.steps, windows, diverged)
 

@@ -6,6 +6,7 @@ that hold it. A new quantity is a metric in `statistics.METRICS` and, here, its 
 condition under which it exists (in `defined`) and a formula (in `fill_sheet`).
 """
 
+import functools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from hybridtrack.compiled import lane_kernel, row_kernel
 from hybridtrack.estimators import Estimates
+from hybridtrack.estimators._lanes import aligned_zeros, copy, fill
 from hybridtrack.models import Array
 from hybridtrack.simulation import Scans
 from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES, Moments
@@ -98,10 +100,10 @@ class Sheet(NamedTuple):
 def blank_sheet(span_steps: int, lanes: int) -> Sheet:
     """A sheet for all estimators of a block."""
     return Sheet(
-        rows=np.full((len(QUANTITIES), lanes), np.nan),
-        scratch=np.full((4, lanes), np.nan),
-        true_mode=np.full(lanes, -1, dtype=np.int64),
-        leading=np.full((span_steps, lanes), np.nan),
+        rows=aligned_zeros(len(QUANTITIES), lanes),
+        scratch=aligned_zeros(4, lanes),
+        true_mode=aligned_zeros(lanes).view(np.int64),
+        leading=aligned_zeros(span_steps, lanes),
     )
 
 
@@ -123,6 +125,8 @@ def as_measured(measurements: Array) -> Estimates:
 
 
 # ---- the formulas ----------------------------------------------------------------------------
+# Loops over lanes stay short: one that reads and writes more than a few rows isn't vectorised,
+# for the compiler would have to check that none of them overlap.
 
 
 @row_kernel
@@ -141,10 +145,19 @@ def add_squared_difference(out, truth, row):
 @lane_kernel
 def squared_error(out, axes, truth, estimate):
     """Squared norm of the vector error; NaN where the estimate isn't finite."""
-    for b in range(out.size):
-        out[b] = 0.0
+    fill(out, 0.0)
     for n in range(axes.shape[0]):
         add_squared_difference(out, truth[axes[n, 0]], estimate[axes[n, 1]])
+
+
+@lane_kernel
+def some_missed(measurement):
+    """Whether any lane has a NaN."""
+    missed = 0
+    for m in range(measurement.shape[0]):
+        for b in range(measurement.shape[1]):
+            missed += 1 if measurement[m, b] != measurement[m, b] else 0
+    return missed > 0
 
 
 @row_kernel
@@ -159,11 +172,19 @@ def leave_out_missed(row, measurement):
 def find_true_mode(out, table, mode):
     """out <- table[mode]; mode (lanes,), or (1,) where all runs have one."""
     if mode.size == 1:
+        only = table[mode[0]]
         for b in range(out.size):
-            out[b] = table[mode[0]]
+            out[b] = only
     else:
         for b in range(out.size):
             out[b] = table[mode[b]]
+
+
+@row_kernel
+def pick(out, row, true_mode, i):
+    """out <- row where the true mode is i."""
+    for b in range(out.size):
+        out[b] = row[b] if true_mode[b] == i else out[b]
 
 
 @lane_kernel
@@ -200,19 +221,24 @@ def score_likelihoods(distinctness, advantage, likelihoods, true_mode, scratch):
     lanes = distinctness.size
     first, second, others = scratch[0], scratch[1], scratch[2]
     for b in range(lanes):
-        first[b] = second[b] = others[b] = -np.inf
+        first[b] = -np.inf
+        second[b] = -np.inf
+        others[b] = -np.inf
         advantage[b] = np.nan
     for i in range(likelihoods.shape[0]):
         for b in range(lanes):
             value = likelihoods[i, b]
-            here = true_mode[b] == i
             beaten = value if value > second[b] else second[b]
             second[b] = first[b] if value > first[b] else beaten
             first[b] = value if value > first[b] else first[b]
-            advantage[b] = value if here else advantage[b]
-            others[b] = value if (not here) & (value > others[b]) else others[b]
+        for b in range(lanes):
+            value = likelihoods[i, b]
+            better = (true_mode[b] != i) & (value > others[b])
+            others[b] = value if better else others[b]
+        pick(advantage, likelihoods[i], true_mode, i)
     for b in range(lanes):
         distinctness[b] = first[b] - second[b]
+    for b in range(lanes):
         advantage[b] -= others[b]
 
 
@@ -225,15 +251,18 @@ def compare_advantages(kept, own, leading):
         kept[b] = enough if known else np.nan
 
 
-@lane_kernel
-def fill_sheet(sheet, layout, k, scans, estimates):
-    """Every quantity of step k of a span; what isn't defined is left as it is."""
+@row_kernel
+def fill_sheet(sheet, layout, k, scans, estimates, missed):
+    """Every quantity of step k of a span; what isn't defined is left as it is.
+
+    missed: whether any lane's scan is.
+    """
     rows, truth, measurement = sheet.rows, scans.truth, scans.measurements[k]
     if layout.position.shape[0]:
         squared_error(rows[POSITION_ROW], layout.position, truth.state[k], estimates.mean[k])
-        for b in range(rows.shape[1]):
-            rows[AT_SCANS_ROW, b] = rows[POSITION_ROW, b]
-        leave_out_missed(rows[AT_SCANS_ROW], measurement)
+        copy(rows[AT_SCANS_ROW], rows[POSITION_ROW])
+        if missed:
+            leave_out_missed(rows[AT_SCANS_ROW], measurement)
     if layout.velocity.shape[0]:
         squared_error(rows[VELOCITY_ROW], layout.velocity, truth.state[k], estimates.mean[k])
     if layout.modes:
@@ -251,21 +280,21 @@ def fill_sheet(sheet, layout, k, scans, estimates):
             likelihoods = estimates.mode_likelihoods[k]
             distinctness = rows[DISTINCTNESS_ROW]
             score_likelihoods(distinctness, advantage, likelihoods, sheet.true_mode, sheet.scratch)
-            leave_out_missed(distinctness, measurement)
-            leave_out_missed(advantage, measurement)
+            if missed:
+                leave_out_missed(distinctness, measurement)
+                leave_out_missed(advantage, measurement)
             for b in range(advantage.size):
                 known = rows[TRUE_MODE_ROW, b] == rows[TRUE_MODE_ROW, b]
                 advantage[b] = advantage[b] if known else np.nan
             if layout.leads:
-                for b in range(advantage.size):
-                    sheet.leading[k, b] = advantage[b]
+                copy(sheet.leading[k], advantage)
             compare_advantages(rows[KEPT_ROW], advantage, sheet.leading[k])
 
 
 # ---- the tally -------------------------------------------------------------------------------
 
 
-@lane_kernel
+@row_kernel
 def add_to_step(row, runs, totals, i, step):
     """Note the moments of a row's first runs, NaN left out; true where all of them are finite."""
     total = 0.0
@@ -280,15 +309,17 @@ def add_to_step(row, runs, totals, i, step):
             d = row[b] - centre
             deviation += d * d
     else:
-        n = 0.0
+        present = 0
         total = 0.0
         for b in range(runs):
-            present = row[b] == row[b]
-            n += 1.0 if present else 0.0
-            total += row[b] if present else 0.0
-        centre = total / n if n > 0.0 else 0.0
+            value = row[b]
+            present += 1 if value == value else 0
+            total += value if value == value else 0.0
+        n = float(present)
+        centre = total / n if present else 0.0
         for b in range(runs):
-            d = row[b] - centre if row[b] == row[b] else 0.0
+            value = row[b]
+            d = value - centre if value == value else 0.0
             deviation += d * d
     totals.n[i, step] = n
     totals.mean[i, step] = centre
@@ -296,7 +327,7 @@ def add_to_step(row, runs, totals, i, step):
     return finite
 
 
-@lane_kernel
+@row_kernel
 def add_to_windows(row, finite, held, sums, numbers, common):
     """Add a row to the sums of the windows that hold its step, NaN left out.
 
@@ -324,7 +355,9 @@ def tally(totals, sheet, layout, step, runs, scans, held, estimates):
     """Score a span that begins at `step` and add it to the totals."""
     n_tallied = layout.tallied.size
     for k in range(estimates.mean.shape[0]):
-        fill_sheet(sheet, layout, k, scans, estimates)
+        measurement = scans.measurements[k]
+        missed = some_missed(measurement)
+        fill_sheet(sheet, layout, k, scans, estimates, missed)
         for i in range(n_tallied):
             row = sheet.rows[layout.tallied[i]]
             finite = add_to_step(row, runs, totals, i, step + k)
@@ -336,10 +369,11 @@ def tally(totals, sheet, layout, step, runs, scans, held, estimates):
             add_to_step(estimates.mode_probabilities[k, j], runs, totals, i, step + k)
             i += 1
             if layout.likelihoods:
-                likelihood = sheet.scratch[0]
-                for b in range(likelihood.size):
-                    likelihood[b] = estimates.mode_likelihoods[k, j, b]
-                leave_out_missed(likelihood, scans.measurements[k])
+                likelihood = estimates.mode_likelihoods[k, j]
+                if missed:
+                    copy(sheet.scratch[0], likelihood)
+                    likelihood = sheet.scratch[0]
+                    leave_out_missed(likelihood, measurement)
                 add_to_step(likelihood, runs, totals, i, step + k)
                 i += 1
 
@@ -353,6 +387,33 @@ def all_below(values, limit):
             for b in range(values.shape[2]):
                 beyond += 0 if abs(values[k, e, b]) < limit else 1
     return beyond == 0
+
+
+class Plan(NamedTuple):
+    """What a tally counts, by name and as the kernel has it."""
+
+    quantities: tuple[str, ...]
+    series: tuple[str, ...]  # the quantities, then what has moments over steps alone
+    layout: Layout
+
+
+@functools.lru_cache
+def plan(names: Names, *, likelihoods: bool, leads: bool, compared: bool) -> Plan:
+    """Blocks have it in common; the arguments are a tally's."""
+    quantities = defined(names, likelihoods=likelihoods, compared=leads or compared)
+    modes = names.modes if len(names.modes) > 1 else ()
+    kinds = ("mode_probability", "mode_likelihood") if likelihoods else ("mode_probability",)
+    layout = Layout(
+        tallied=np.array([QUANTITIES.index(q) for q in quantities], dtype=np.int64),
+        position=names.axes(""),
+        velocity=names.axes("v"),
+        true_mode=names.true_mode(),
+        modes=len(modes),
+        likelihoods=likelihoods,
+        leads=leads,
+    )
+    series = (f"{kind}:{mode}" for mode in modes for kind in kinds)
+    return Plan(quantities, (*quantities, *series), layout)
 
 
 class Tally:
@@ -375,52 +436,39 @@ class Tally:
         likelihoods: the estimates hold them; leads: `compare_with` names this estimator, which
         then is tallied before the others; compared: this one or a leading one has an advantage.
         """
-        self._quantities = defined(names, likelihoods=likelihoods, compared=leads or compared)
+        self._plan = plan(names, likelihoods=likelihoods, leads=leads, compared=compared)
         self._windows = windows
-        self._series = list(self._quantities)
-        modes = names.modes if len(names.modes) > 1 else ()
-        for mode in modes:
-            self._series.append(f"mode_probability:{mode}")
-            if likelihoods:
-                self._series.append(f"mode_likelihood:{mode}")
         self._sheet = sheet
         self._runs = runs
-        self.has_advantage = KEPT in self._quantities
-        self._layout = Layout(
-            tallied=np.array([QUANTITIES.index(q) for q in self._quantities], dtype=np.int64),
-            position=names.axes(""),
-            velocity=names.axes("v"),
-            true_mode=names.true_mode(),
-            modes=len(modes),
-            likelihoods=likelihoods,
-            leads=leads,
-        )
-        series, cells = (len(self._series), n_steps), (len(self._quantities), len(windows))
+        self.has_advantage = KEPT in self._plan.quantities
+        series = (len(self._plan.series), n_steps)
+        cells = (len(self._plan.quantities), len(windows))
         lanes = sheet.rows.shape[1]
         self._totals = Totals(
             n=np.zeros(series),
             mean=np.zeros(series),
             squares=np.zeros(series),
-            sums=np.zeros((*cells, lanes)),
-            numbers=np.zeros((*cells, lanes)),
+            sums=aligned_zeros(*cells, lanes),
+            numbers=aligned_zeros(*cells, lanes),
             common=np.zeros(cells),
         )
 
     def add(self, step: int, scans: Scans, held: NDArray[np.bool_], estimates: Estimates) -> None:
         """Score a span that begins at `step`; held (n_steps, n_windows, lanes or 1)."""
-        tally(self._totals, self._sheet, self._layout, step, self._runs, scans, held, estimates)
+        arguments = (self._totals, self._sheet, self._plan.layout, step, self._runs)
+        tally(*arguments, scans, held, estimates)
 
     def steps(self) -> Iterator[tuple[str, Moments]]:
         """Each quantity's moments at every step (n_steps,)."""
-        for i, name in enumerate(self._series):
+        n, mean, squares = self._totals[:3]
+        for i, name in enumerate(self._plan.series):
             if name != POSITION_AT_SCANS:
-                totals = self._totals
-                yield name, Moments(totals.n[i], totals.mean[i], totals.squares[i])
+                yield name, Moments(n[i], mean[i], squares[i])
 
     def sums(self) -> Iterator[tuple[tuple[str, str], tuple[Array, Array]]]:
         """By window and quantity, the runs' sums (runs,) and how many steps each has."""
-        sums = self._totals.sums[..., : self._runs].copy()
-        numbers = self._totals.numbers[..., : self._runs] + self._totals.common[..., np.newaxis]
-        for i, quantity in enumerate(self._quantities):
+        numbers = self._totals.numbers + self._totals.common[..., np.newaxis]
+        for i, quantity in enumerate(self._plan.quantities):
             for w, window in enumerate(self._windows):
-                yield (window, quantity), (sums[i, w], numbers[i, w])
+                sums = self._totals.sums[i, w, : self._runs]
+                yield (window, quantity), (sums, numbers[i, w, : self._runs])

@@ -189,10 +189,14 @@ class Case(NamedTuple):
     recorded: Array | None = None  # (n_steps + 1, n_y): measurements as recorded, no sensor drawn
 
 
-def spans(n_steps: int, length: int) -> Iterator[slice]:
-    """Steps 0 .. n_steps cut into spans of the given length."""
-    for begin in range(0, n_steps, length):
-        yield slice(begin, min(begin + length, n_steps))
+def spans(n_steps: int, longest: int) -> Iterator[slice]:
+    """Steps 0 .. n_steps cut into as few spans as can be, of one length or nearly so.
+
+    What is kept from span to span need not be allocated anew for a short last one.
+    """
+    number = -(-n_steps // longest)
+    for i in range(number):
+        yield slice(i * n_steps // number, (i + 1) * n_steps // number)
 
 
 def step_lengths(times_s: Array) -> Array:
@@ -213,17 +217,18 @@ class BlockSimulation:
         self._lanes = lanes
         self._case = case
         self._sensor = sensor
-        self._streams = {purpose: stream(seed, case_index, block, purpose) for purpose in Purpose}
+        self._key = (seed, case_index, block)
+        self._streams: dict[Purpose, np.random.Generator] = {}
         self._noise_root = square_root(sensor.noise_covariance)
         truth = case.truth
         if isinstance(truth, ChainTruth):
             self.state_names = truth.bank.state_names
             n_x = len(self.state_names)
-            draws = self._streams[Purpose.INITIAL_STATE].standard_normal((n_x, BLOCK_RUNS))
+            draws = self._stream(Purpose.INITIAL_STATE).standard_normal((n_x, BLOCK_RUNS))
             self._state = truth.initial_mean[:, None] + (
                 square_root(truth.initial_covariance) @ draws
             )
-            uniform = self._streams[Purpose.MODE_SEQUENCE].random(BLOCK_RUNS)
+            uniform = self._stream(Purpose.MODE_SEQUENCE).random(BLOCK_RUNS)
             cumulative = np.cumsum(truth.bank.initial_mode_probabilities)[:-1]
             self._mode: Modes = np.searchsorted(cumulative, uniform, side="right")
             self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
@@ -237,9 +242,15 @@ class BlockSimulation:
             self.state_names.index(axis) for axis in "xy" if axis in self.state_names
         ]
 
+    def _stream(self, purpose: Purpose) -> np.random.Generator:
+        """The purpose's stream, begun when first asked for: most cases need few of them."""
+        if purpose not in self._streams:
+            self._streams[purpose] = stream(*self._key, purpose)
+        return self._streams[purpose]
+
     def initial_estimate_noise(self, n_x: int) -> Array:
         """Standard normal draws (n_x, lanes) for a start drawn about the truth."""
-        draws = self._streams[Purpose.INITIAL_ESTIMATE].standard_normal((n_x, BLOCK_RUNS))
+        draws = self._stream(Purpose.INITIAL_ESTIMATE).standard_normal((n_x, BLOCK_RUNS))
         return draws[:, : self._lanes]
 
     def advance(self, span: slice) -> Scans:
@@ -260,10 +271,11 @@ class BlockSimulation:
         if self._case.recorded is not None:
             scans = self._case.recorded[span.start + 1 : span.stop + 1, :, np.newaxis]
             return Scans(truth, np.repeat(scans, BLOCK_RUNS, axis=2))
-        draws = self._streams[Purpose.MEASUREMENT_NOISE].standard_normal((steps, n_y, BLOCK_RUNS))
-        measurements = truth.state[:, self._positions] + self._shape_noise(draws, truth.mode)
+        draws = self._stream(Purpose.MEASUREMENT_NOISE).standard_normal((steps, n_y, BLOCK_RUNS))
+        measurements = self._shape_noise(draws, truth.mode)
+        measurements += truth.state[:, self._positions]
         if self._sensor.detection_probability < 1.0:
-            uniform = self._streams[Purpose.DETECTION].random((steps, BLOCK_RUNS))
+            uniform = self._stream(Purpose.DETECTION).random((steps, BLOCK_RUNS))
             missed = uniform >= self._sensor.detection_probability
             missed[: max(self._sensor.certain_scans - span.start, 0)] = False
             measurements[np.repeat(missed[:, np.newaxis], n_y, axis=1)] = np.nan
@@ -292,11 +304,11 @@ class BlockSimulation:
             )
         model = truth_model(truth, self._step_s[span])
         steps, n_x = span.stop - span.start, len(self.state_names)
-        uniform = self._streams[Purpose.MODE_SEQUENCE].random((steps, BLOCK_RUNS))
+        uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
         modes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
         before = self._mode.copy()
         _draw_modes(self._mode, uniform, np.cumsum(model.transition_matrix, axis=-1), modes)
-        noise = self._streams[Purpose.PROCESS_NOISE].standard_normal((steps, n_x, BLOCK_RUNS))
+        noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, n_x, BLOCK_RUNS))
         state = np.empty((steps, n_x, BLOCK_RUNS))
         root = np.ascontiguousarray(square_root(model.process_noise_covariance))
         arguments: tuple[Any, ...] = (model.state_transition, model.input_effect, root, state)
