@@ -182,6 +182,11 @@ class _Block:
         labels = (RAW, *(chosen.label for chosen in experiment.estimators))
         self._status = {label: np.zeros(task.runs, dtype=np.int64) for label in labels}
         self._tracks: dict[tuple[int, str, str], Array] = {}
+        self._held: NDArray[np.bool_] | None = None
+        fixed, everything = self._simulation.fixed, slice(0, self._n_steps)
+        if fixed is not None:
+            self._held = self._windows(everything, fixed)
+            self._note_shares(everything, fixed)
 
     def run(self, stop: threading.Event) -> BlockResult:
         for span in spans(self._n_steps, SPAN_STEPS):
@@ -190,10 +195,12 @@ class _Block:
             scans = self._simulation.advance(span)
             if not self._running:
                 self._start(scans)
-            self._note_truth(span, scans)
+            if self._held is None:
+                self._note_shares(span, scans.truth)
+            self._keep_truth(span, scans)
             used = max(self._first_step - span.start, 0)  # scans of a two-point start
             if used:
-                span, scans = slice(span.start + used, span.stop), scans.after(used)
+                span, scans = slice(span.start + used, span.stop), scans.cut(slice(used, None))
             if span.start < span.stop:
                 self._advance(span, scans)
         return self._result()
@@ -269,9 +276,7 @@ class _Block:
 
     def _advance(self, span: slice, scans: Scans) -> None:
         """Filter and score scans that none of the filters started from."""
-        times_s = self._case.times_s[span.start + 1 : span.stop + 1]
-        windows = self._experiment.windows
-        held = np.stack([inside(w, times_s, span.start, scans.truth) for w in windows], axis=1)
+        held = self._windows(span, scans.truth) if self._held is None else self._held[span]
         self._score(span, RAW, scans, held, as_measured(scans.measurements))
         models = self._even_models if self._even else self._models(self._step_s[span])
         covariance = self._task.tracks > 0
@@ -313,21 +318,20 @@ class _Block:
             compared=leading is not None and leading.has_advantage,
         )
 
-    def _note_truth(self, span: slice, scans: Scans) -> None:
+    def _windows(self, span: slice, truth: TruthSpan) -> NDArray[np.bool_]:
+        """Which windows hold a span's steps (n_steps, n_windows, lanes or 1)."""
+        times_s = self._case.times_s[span.start + 1 : span.stop + 1]
+        windows = self._experiment.windows
+        return np.stack([inside(w, times_s, span.start, truth) for w in windows], axis=1)
+
+    def _note_shares(self, span: slice, truth: TruthSpan) -> None:
+        """Moments of the truth's being in each of its modes."""
         runs = self._task.runs
         for j, moments in enumerate(self._shares.values()):
-            share = (scans.truth.mode[:, :runs] == j).mean(axis=1)
+            share = (truth.mode[:, :runs] == j).mean(axis=1)
             moments.n[span] = runs
             moments.mean[span] = share
             moments.squares[span] = runs * share * (1.0 - share)
-        if not self._task.tracks:
-            return
-        for e, name in enumerate(self._simulation.state_names):
-            self._keep(span, TRUTH, name, scans.truth.state[:, e])
-        if self._experiment.truth_modes:
-            self._keep(span, TRUTH, "mode", scans.truth.mode.astype(np.float64))
-        for m in range(scans.measurements.shape[1]):
-            self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
 
     def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
         """Note the step at which a run diverges; from there on its estimates are NaN."""
@@ -343,6 +347,16 @@ class _Block:
                 array[first:, ..., b] = np.nan
 
     # ---- tracks of the first runs ----
+
+    def _keep_truth(self, span: slice, scans: Scans) -> None:
+        if not self._task.tracks:
+            return
+        for e, name in enumerate(self._simulation.state_names):
+            self._keep(span, TRUTH, name, scans.truth.state[:, e])
+        if self._experiment.truth_modes:
+            self._keep(span, TRUTH, "mode", scans.truth.mode.astype(np.float64))
+        for m in range(scans.measurements.shape[1]):
+            self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
 
     def _keep_estimates(
         self, span: slice, label: str, running: Running, estimates: Estimates

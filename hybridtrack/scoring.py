@@ -468,7 +468,7 @@ class Tally:
     def sums(self) -> Iterator[tuple[tuple[str, str], tuple[Array, Array]]]:
         """By window and quantity, the runs' sums (runs,) and how many steps each has."""
         numbers = self._totals.numbers + self._totals.common[..., np.newaxis]
-        for i, quantity in enumerate(self._plan.quantities):
-            for w, window in enumerate(self._windows):
-                sums = self._totals.sums[i, w, : self._runs]
-                yield (window, quantity), (sums, numbers[i, w, : self._runs])
+        both = (array[..., : self._runs] for array in (self._totals.sums, numbers))
+        for quantity, *by_window in zip(self._plan.quantities, *both, strict=True):
+            for window, *totals in zip(self._windows, *by_window, strict=True):
+                yield (window, quantity), (totals[0], totals[1])

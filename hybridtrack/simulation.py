@@ -120,6 +120,10 @@ class TruthSpan(NamedTuple):
     mode: Modes  # (n_steps, lanes or 1), -1 where there is none
     since_switch_s: Array  # (n_steps, lanes or 1) since the last switch of mode; inf before it
 
+    def cut(self, steps: slice) -> "TruthSpan":
+        """Some of the steps."""
+        return TruthSpan(self.state[steps], self.mode[steps], self.since_switch_s[steps])
+
 
 @kernel
 def _draw_modes(mode, uniform, cumulative, out):
@@ -135,18 +139,26 @@ def _draw_modes(mode, uniform, cumulative, out):
 
 @kernel
 def _drive(state, modes, noise, state_transition, input_effect, noise_root, out):
+    """x <- F_j x + b_j + L_j w, j the mode of each lane, every mode's in turn: rows of lanes."""
     n_x, lanes = state.shape
+    row = np.empty(lanes)
     for k in range(modes.shape[0]):
         f = k if state_transition.shape[0] > 1 else 0
-        for a in range(n_x):
-            for b in range(lanes):
-                j = modes[k, b]
-                value = input_effect[f, j, a]
+        before = out[k - 1] if k > 0 else state
+        for j in range(state_transition.shape[1]):
+            for a in range(n_x):
+                row[:] = input_effect[f, j, a]
                 for e in range(n_x):
-                    value += state_transition[f, j, a, e] * state[e, b]
-                    value += noise_root[f, j, a, e] * noise[k, e, b]
-                out[k, a, b] = value
-        state[:] = out[k]
+                    transition, root = state_transition[f, j, a, e], noise_root[f, j, a, e]
+                    if transition != 0.0:
+                        for b in range(lanes):
+                            row[b] += transition * before[e, b]
+                    if root != 0.0:
+                        for b in range(lanes):
+                            row[b] += root * noise[k, e, b]
+                for b in range(lanes):
+                    out[k, a, b] = row[b] if modes[k, b] == j else out[k, a, b]
+    state[:] = out[-1]
 
 
 def square_root(covariance: Array) -> Array:
@@ -173,11 +185,9 @@ class Scans(NamedTuple):
     truth: TruthSpan
     measurements: Array  # (n_steps, n_y, lanes), NaN where missed
 
-    def after(self, steps: int) -> "Scans":
-        """Without the first steps."""
-        state, mode, since_switch_s = self.truth
-        truth = TruthSpan(state[steps:], mode[steps:], since_switch_s[steps:])
-        return Scans(truth, self.measurements[steps:])
+    def cut(self, steps: slice) -> "Scans":
+        """Some of the steps."""
+        return Scans(self.truth.cut(steps), self.measurements[steps])
 
 
 class Case(NamedTuple):
@@ -220,6 +230,10 @@ class BlockSimulation:
         self._key = (seed, case_index, block)
         self._streams: dict[Purpose, np.random.Generator] = {}
         self._noise_root = square_root(sensor.noise_covariance)
+        axes = np.diagonal(self._noise_root, axis1=1, axis2=2)[..., np.newaxis]  # (n_modes, n_y, 1)
+        alone = len(axes) == 1 and not np.any(self._noise_root[0] - np.diag(axes[0, :, 0]))
+        self._noise_std = axes[0] if alone else None  # where axes are independent of one another
+        self.fixed: TruthSpan | None = None  # the truth of all steps, if every run has the same
         truth = case.truth
         if isinstance(truth, ChainTruth):
             self.state_names = truth.bank.state_names
@@ -237,7 +251,12 @@ class BlockSimulation:
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
-            self._since_switch_s = _since_switch(case.times_s, truth.mode)
+            since_switch_s = _since_switch(case.times_s, truth.mode)
+            self.fixed = TruthSpan(
+                truth.state[1:, :, np.newaxis],
+                truth.mode[1:, np.newaxis],
+                since_switch_s[1:, np.newaxis],
+            )
         self._positions = [
             self.state_names.index(axis) for axis in "xy" if axis in self.state_names
         ]
@@ -283,10 +302,10 @@ class BlockSimulation:
 
     def _shape_noise(self, draws: Array, modes: Modes) -> Array:
         root = self._noise_root
+        if self._noise_std is not None:
+            draws *= self._noise_std
+            return draws
         if len(root) == 1:
-            if not np.any(root[0] - np.diag(np.diagonal(root[0]))):
-                draws *= np.diagonal(root[0])[:, np.newaxis]
-                return draws
             shaped: Array = np.einsum("ml,klb->kmb", root[0], draws)
         else:
             by_run = root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))]
@@ -294,14 +313,10 @@ class BlockSimulation:
         return shaped
 
     def _advance_truth(self, span: slice) -> TruthSpan:
+        if self.fixed is not None:
+            return self.fixed.cut(span)
         truth = self._case.truth
-        here = slice(span.start + 1, span.stop + 1)
-        if isinstance(truth, FixedTruth):
-            return TruthSpan(
-                truth.state[here, :, np.newaxis],
-                truth.mode[here, np.newaxis],
-                self._since_switch_s[here, np.newaxis],
-            )
+        assert isinstance(truth, ChainTruth)
         model = truth_model(truth, self._step_s[span])
         steps, n_x = span.stop - span.start, len(self.state_names)
         uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
