@@ -12,7 +12,7 @@ from hybridtrack.config import Experiment, Window
 from hybridtrack.estimators import Estimates, Running
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
-from hybridtrack.scoring import Names, Tally, all_below, as_measured, blank_sheet
+from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
@@ -31,6 +31,7 @@ from hybridtrack.statistics import (
     merge_sum_moments,
     sum_moments,
 )
+from hybridtrack.tallies import Tally
 
 SPAN_STEPS = 50  # at most, between two looks at Python: their arrays stay in the cache
 LANE_GROUP = 32  # lanes are filtered in whole groups, so that each takes the same instructions
@@ -101,8 +102,8 @@ def _merged(a: dict[Key, M], b: dict[Key, M], merge_all: Callable[[M, M], M]) ->
     if not a:
         return {}
     kind = type(next(iter(a.values())))
-    together = (np.array([group[key] for key in a]) for group in (a, b))
-    merged = merge_all(*(kind(*np.moveaxis(fields, 1, 0)) for fields in together))
+    together = (zip(*(group[key] for key in a), strict=True) for group in (a, b))
+    merged = merge_all(*(kind(*map(np.array, fields)) for fields in together))
     return dict(zip(a, map(kind, *merged), strict=True))
 
 

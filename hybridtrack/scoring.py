@@ -1,13 +1,10 @@
-"""Estimates scored span by span: each quantity of a run and step, tallied while it is in the cache.
+"""What estimates are worth: every quantity of a run and step, as rows of lanes on a sheet.
 
-One compiled pass goes over the steps of a span. At each it fills a *sheet*, a row of lanes per
-quantity, and adds the rows to the moments of that step and to every run's sums over the windows
-that hold it. A new quantity is a metric in `statistics.METRICS` and, here, its row's name, the
-condition under which it exists (in `defined`) and a formula (in `fill_sheet`).
+A *sheet* has one row per quantity and holds one step of one estimator. A new quantity is a metric
+in `statistics.METRICS` and three things here: its row, the condition under which it exists (in
+`defined`) and its formula (in `fill_sheet`).
 """
 
-import functools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +14,7 @@ from hybridtrack.compiled import lane_kernel, row_kernel
 from hybridtrack.estimators import Estimates
 from hybridtrack.estimators._lanes import aligned_zeros, copy, fill
 from hybridtrack.models import Array
-from hybridtrack.simulation import Scans
-from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES, Moments
+from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES
 
 ROUNDING = 1e-9  # likelihoods sum to 1; two filters that are one in theory differ by less
 
@@ -41,7 +37,12 @@ class Names(NamedTuple):
     truth_states: tuple[str, ...]
     truth_modes: tuple[str, ...]  # () where the truth has none
     states: tuple[str, ...]  # the estimator's
-    modes: tuple[str, ...]  # the estimator's; one mode has no probabilities to score
+    modes: tuple[str, ...]  # the estimator's
+
+    @property
+    def scored_modes(self) -> tuple[str, ...]:
+        """The estimator's modes, where there are several: one has no probabilities to score."""
+        return self.modes if len(self.modes) > 1 else ()
 
     def axes(self, kind: str) -> Integers:
         """Where truth and estimate have the vector's common axes (n, 2); kind '' or 'v'."""
@@ -58,10 +59,11 @@ class Names(NamedTuple):
 def defined(names: Names, *, likelihoods: bool, compared: bool) -> tuple[str, ...]:
     """The quantities that exist, in the order in which they are tallied.
 
-    likelihoods: the estimator gives its modes' likelihoods; compared: so does `compare_with`.
+    likelihoods: the estimates hold its modes' likelihoods; compared: those of the estimator that
+    `compare_with` names, which may be this one, can be compared with them.
     """
-    modes = len(names.modes) > 1
-    common = modes and bool({*names.truth_modes} & {*names.modes})
+    modes = bool(names.scored_modes)
+    common = bool({*names.truth_modes} & {*names.scored_modes})
     position = bool(len(names.axes("")))
     exists = {
         POSITION: position,
@@ -77,13 +79,13 @@ def defined(names: Names, *, likelihoods: bool, compared: bool) -> tuple[str, ..
 
 
 class Layout(NamedTuple):
-    """What the kernel has to know of the names."""
+    """What the kernels have to know of the names."""
 
-    tallied: Integers  # (n_tallied,) rows of the sheet
+    tallied: Integers  # (n_tallied,) rows of the sheet, in the order of `defined`
     position: Integers  # (n_axes, 2) the truth's state, the estimate's
     velocity: Integers  # (n_axes, 2)
     true_mode: Integers  # (n_truth_modes + 1,) the estimator's mode by the truth's; -1 for none
-    modes: int  # how many modes are scored; 0 where there is but one
+    modes: int  # how many are scored
     likelihoods: bool  # whether the estimates hold them
     leads: bool  # whether the others' advantage is compared with this one's
 
@@ -97,6 +99,20 @@ class Sheet(NamedTuple):
     leading: Array  # (n_steps, lanes) likelihood advantage under `compare_with`, for a whole span
 
 
+def layout(names: Names, *, likelihoods: bool, leads: bool, compared: bool) -> Layout:
+    """The arguments are those of `defined`; leads: see Layout."""
+    quantities = defined(names, likelihoods=likelihoods, compared=compared)
+    return Layout(
+        tallied=np.array([QUANTITIES.index(q) for q in quantities], dtype=np.int64),
+        position=names.axes(""),
+        velocity=names.axes("v"),
+        true_mode=names.true_mode(),
+        modes=len(names.scored_modes),
+        likelihoods=likelihoods,
+        leads=leads,
+    )
+
+
 def blank_sheet(span_steps: int, lanes: int) -> Sheet:
     """A sheet for all estimators of a block."""
     return Sheet(
@@ -105,17 +121,6 @@ def blank_sheet(span_steps: int, lanes: int) -> Sheet:
         true_mode=aligned_zeros(lanes).view(np.int64),
         leading=aligned_zeros(span_steps, lanes),
     )
-
-
-class Totals(NamedTuple):
-    """What the rows add up to; first the tallied quantities, then series over steps alone."""
-
-    n: Array  # (n_series, n_steps)
-    mean: Array  # (n_series, n_steps)
-    squares: Array  # (n_series, n_steps)
-    sums: Array  # (n_tallied, n_windows, lanes)
-    numbers: Array  # (n_tallied, n_windows, lanes) steps counted run by run
-    common: Array  # (n_tallied, n_windows) steps counted for all runs at once
 
 
 def as_measured(measurements: Array) -> Estimates:
@@ -291,93 +296,6 @@ def fill_sheet(sheet, layout, k, scans, estimates, missed):
             compare_advantages(rows[KEPT_ROW], advantage, sheet.leading[k])
 
 
-# ---- the tally -------------------------------------------------------------------------------
-
-
-@row_kernel
-def add_to_step(row, runs, totals, i, step):
-    """Note the moments of a row's first runs, NaN left out; true where all of them are finite."""
-    total = 0.0
-    for b in range(runs):
-        total += row[b]
-    finite = abs(total) < np.inf
-    deviation = 0.0
-    if finite:  # nearly always: NaN and infinity would have spoilt the sum
-        n = float(runs)
-        centre = total / n
-        for b in range(runs):
-            d = row[b] - centre
-            deviation += d * d
-    else:
-        present = 0
-        total = 0.0
-        for b in range(runs):
-            value = row[b]
-            present += 1 if value == value else 0
-            total += value if value == value else 0.0
-        n = float(present)
-        centre = total / n if present else 0.0
-        for b in range(runs):
-            value = row[b]
-            d = value - centre if value == value else 0.0
-            deviation += d * d
-    totals.n[i, step] = n
-    totals.mean[i, step] = centre
-    totals.squares[i, step] = deviation
-    return finite
-
-
-@row_kernel
-def add_to_windows(row, finite, held, sums, numbers, common):
-    """Add a row to the sums of the windows that hold its step, NaN left out.
-
-    held (n_windows, lanes), or (n_windows, 1) where all runs have the same windows.
-    """
-    for w in range(held.shape[0]):
-        if held.shape[1] > 1:
-            for b in range(row.size):
-                present = held[w, b] & (row[b] == row[b])
-                sums[w, b] += row[b] if present else 0.0
-                numbers[w, b] += 1.0 if present else 0.0
-        elif held[w, 0] and finite:
-            common[w] += 1.0
-            for b in range(row.size):
-                sums[w, b] += row[b]
-        elif held[w, 0]:
-            for b in range(row.size):
-                present = row[b] == row[b]
-                sums[w, b] += row[b] if present else 0.0
-                numbers[w, b] += 1.0 if present else 0.0
-
-
-@lane_kernel
-def tally(totals, sheet, layout, step, runs, scans, held, estimates):
-    """Score a span that begins at `step` and add it to the totals."""
-    n_tallied = layout.tallied.size
-    for k in range(estimates.mean.shape[0]):
-        measurement = scans.measurements[k]
-        missed = some_missed(measurement)
-        fill_sheet(sheet, layout, k, scans, estimates, missed)
-        for i in range(n_tallied):
-            row = sheet.rows[layout.tallied[i]]
-            finite = add_to_step(row, runs, totals, i, step + k)
-            add_to_windows(
-                row, finite, held[k], totals.sums[i], totals.numbers[i], totals.common[i]
-            )
-        i = n_tallied
-        for j in range(layout.modes):
-            add_to_step(estimates.mode_probabilities[k, j], runs, totals, i, step + k)
-            i += 1
-            if layout.likelihoods:
-                likelihood = estimates.mode_likelihoods[k, j]
-                if missed:
-                    copy(sheet.scratch[0], likelihood)
-                    likelihood = sheet.scratch[0]
-                    leave_out_missed(likelihood, measurement)
-                add_to_step(likelihood, runs, totals, i, step + k)
-                i += 1
-
-
 @lane_kernel
 def all_below(values, limit):
     """Whether every |value| of (n_steps, n, lanes) is below the limit, which NaN isn't."""
@@ -387,88 +305,3 @@ def all_below(values, limit):
             for b in range(values.shape[2]):
                 beyond += 0 if abs(values[k, e, b]) < limit else 1
     return beyond == 0
-
-
-class Plan(NamedTuple):
-    """What a tally counts, by name and as the kernel has it."""
-
-    quantities: tuple[str, ...]
-    series: tuple[str, ...]  # the quantities, then what has moments over steps alone
-    layout: Layout
-
-
-@functools.lru_cache
-def plan(names: Names, *, likelihoods: bool, leads: bool, compared: bool) -> Plan:
-    """Blocks have it in common; the arguments are a tally's."""
-    quantities = defined(names, likelihoods=likelihoods, compared=leads or compared)
-    modes = names.modes if len(names.modes) > 1 else ()
-    kinds = ("mode_probability", "mode_likelihood") if likelihoods else ("mode_probability",)
-    layout = Layout(
-        tallied=np.array([QUANTITIES.index(q) for q in quantities], dtype=np.int64),
-        position=names.axes(""),
-        velocity=names.axes("v"),
-        true_mode=names.true_mode(),
-        modes=len(modes),
-        likelihoods=likelihoods,
-        leads=leads,
-    )
-    series = (f"{kind}:{mode}" for mode in modes for kind in kinds)
-    return Plan(quantities, (*quantities, *series), layout)
-
-
-class Tally:
-    """One estimator's scores over one block of runs."""
-
-    def __init__(
-        self,
-        names: Names,
-        n_steps: int,
-        windows: tuple[str, ...],
-        sheet: Sheet,
-        runs: int,
-        *,
-        likelihoods: bool = False,
-        leads: bool = False,
-        compared: bool = False,
-    ) -> None:
-        """The sheet may be shared; runs: how many of its lanes count.
-
-        likelihoods: the estimates hold them; leads: `compare_with` names this estimator, which
-        then is tallied before the others; compared: this one or a leading one has an advantage.
-        """
-        self._plan = plan(names, likelihoods=likelihoods, leads=leads, compared=compared)
-        self._windows = windows
-        self._sheet = sheet
-        self._runs = runs
-        self.has_advantage = KEPT in self._plan.quantities
-        series = (len(self._plan.series), n_steps)
-        cells = (len(self._plan.quantities), len(windows))
-        lanes = sheet.rows.shape[1]
-        self._totals = Totals(
-            n=np.zeros(series),
-            mean=np.zeros(series),
-            squares=np.zeros(series),
-            sums=aligned_zeros(*cells, lanes),
-            numbers=aligned_zeros(*cells, lanes),
-            common=np.zeros(cells),
-        )
-
-    def add(self, step: int, scans: Scans, held: NDArray[np.bool_], estimates: Estimates) -> None:
-        """Score a span that begins at `step`; held (n_steps, n_windows, lanes or 1)."""
-        arguments = (self._totals, self._sheet, self._plan.layout, step, self._runs)
-        tally(*arguments, scans, held, estimates)
-
-    def steps(self) -> Iterator[tuple[str, Moments]]:
-        """Each quantity's moments at every step (n_steps,)."""
-        n, mean, squares = self._totals[:3]
-        for i, name in enumerate(self._plan.series):
-            if name != POSITION_AT_SCANS:
-                yield name, Moments(n[i], mean[i], squares[i])
-
-    def sums(self) -> Iterator[tuple[tuple[str, str], tuple[Array, Array]]]:
-        """By window and quantity, the runs' sums (runs,) and how many steps each has."""
-        numbers = self._totals.numbers + self._totals.common[..., np.newaxis]
-        both = (array[..., : self._runs] for array in (self._totals.sums, numbers))
-        for quantity, *by_window in zip(self._plan.quantities, *both, strict=True):
-            for window, *totals in zip(self._windows, *by_window, strict=True):
-                yield (window, quantity), (totals[0], totals[1])

@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 from hybridtrack.estimators import Estimates
-from hybridtrack.scoring import (
-    Names,
-    Tally,
-    Totals,
-    add_to_step,
-    all_below,
-    as_measured,
-    blank_sheet,
-)
+from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import Scans, TruthSpan
 from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES
+from hybridtrack.tallies import Tally, Totals, add_to_step
 
 ROUNDING = 1e-12  # relative: some 1e2 operations of 1e-16, a margin of 100
 
