@@ -21,7 +21,7 @@ from problem import Array, Problem
 from hybridtrack.blocks import SPAN_STEPS
 from hybridtrack.estimators import Estimates, _bank, _layout, estimators
 from hybridtrack.simulation import BLOCK_RUNS, spans
-from hybridtrack.vectors import WIDTH
+from hybridtrack.vectors import WIDTH, aligned_zeros
 
 Filter = Callable[[bool], tuple[Array, Array] | None]
 Competitor = Callable[[Problem], Filter]
@@ -142,12 +142,12 @@ def cpp(problem: Problem, algebra: str, lanes: int = WIDTH) -> Filter:
         ]
     )
     group = np.repeat(start_of_a_lane, lanes)
-    mixed = _layout.aligned_zeros(n_modes * (n_x + len(lower[0]) + 3) * lanes)
+    mixed = aligned_zeros(n_modes * (n_x + len(lower[0]) + 3) * lanes)
     function = getattr(_library(lanes), f"advance_{algebra}_{n_x}_{n_y}")
     function.restype = None
 
     def start() -> Advance:
-        state = _layout.aligned_zeros(BLOCK_RUNS // lanes, group.size)
+        state = aligned_zeros(BLOCK_RUNS // lanes, group.size)
         state[:] = group
 
         def advance(z: Array, room: Estimates) -> None:

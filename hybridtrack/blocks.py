@@ -1,7 +1,9 @@
 """One block of runs: truth -> measurements -> estimates -> running statistics."""
 
+import functools
 import threading
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,8 @@ from numpy.typing import NDArray
 from hybridtrack.config import Experiment, Window
 from hybridtrack.estimators import Estimates, Running
 from hybridtrack.executors import Stopped
-from hybridtrack.models import Array, JumpMarkovModel
+from hybridtrack.models import Array, JumpMarkovModel, ModeBank
+from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
@@ -22,22 +25,16 @@ from hybridtrack.simulation import (
     two_point_start,
 )
 from hybridtrack.statistics import (
-    POSITION_AT_SCANS,
     Moments,
-    Names,
     SumMoments,
-    accumulate_steps,
-    accumulate_window,
-    advantage_kept,
     merge_moments,
     merge_sum_moments,
-    score,
-    score_measurements,
     sum_moments,
 )
+from hybridtrack.tallies import Tally
+from hybridtrack.vectors import WIDTH
 
-SPAN_STEPS = 32  # steps between two looks at Python: their arrays stay in the cache
-LANE_GROUP = 32  # lanes are filtered in whole groups, so that each takes the same instructions
+SPAN_STEPS = 50  # at most, between two looks at Python: their arrays stay in the cache
 DIVERGED = 1e60  # an estimate beyond this has no use, and its fourth power must stay finite
 
 RAW = "raw"
@@ -45,6 +42,9 @@ TRUTH = "truth"
 
 Series = tuple[str, str]  # estimator, quantity
 Cell = tuple[str, str, str]  # estimator, window, quantity
+
+Key = TypeVar("Key", Series, Cell)
+M = TypeVar("M", Moments, SumMoments)
 
 
 class BlockTask(NamedTuple):
@@ -91,18 +91,30 @@ def run_block(experiment: Experiment, task: BlockTask, stop: threading.Event) ->
 def merge(a: GroupStatistics, b: GroupStatistics) -> GroupStatistics:
     """Two groups together; `a` comes first in the order of blocks."""
     return GroupStatistics(
-        {key: merge_moments(a.steps[key], b.steps[key]) for key in a.steps},
-        {key: merge_sum_moments(a.windows[key], b.windows[key]) for key in a.windows},
+        _merged(a.steps, b.steps, merge_moments),
+        _merged(a.windows, b.windows, merge_sum_moments),
         {key: a.diverged[key] + b.diverged[key] for key in a.diverged},
     )
 
 
+def _merged(a: dict[Key, M], b: dict[Key, M], merge_all: Callable[[M, M], M]) -> dict[Key, M]:
+    """Moments of the same keys merged all at once: a call of NumPy costs more than its work."""
+    if not a:
+        return {}
+    kind = type(next(iter(a.values())))
+    together = (zip(*(group[key] for key in a), strict=True) for group in (a, b))
+    merged = merge_all(*(kind(*map(np.array, fields)) for fields in together))
+    return dict(zip(a, map(kind, *merged), strict=True))
+
+
 def summarise(result: BlockResult) -> GroupStatistics:
     """A block as a group of its own."""
-    windows = {
-        cell: sum_moments(sums, numbers, result.status[cell[0]] == 0)
-        for cell, (sums, numbers) in result.sums.items()
-    }
+    windows: dict[Cell, SumMoments] = {}
+    if result.sums:
+        sums, numbers = (np.array([pair[i] for pair in result.sums.values()]) for i in (0, 1))
+        sound = {label: status == 0 for label, status in result.status.items()}
+        moments = sum_moments(sums, numbers, np.array([sound[cell[0]] for cell in result.sums]))
+        windows = dict(zip(result.sums, map(SumMoments, *moments), strict=True))
     diverged = {label: int((status > 0).sum()) for label, status in result.status.items()}
     return GroupStatistics(result.steps, windows, diverged)
 
@@ -121,6 +133,26 @@ def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) ->
     return mask
 
 
+class _Same(NamedTuple):
+    """A bank as a key: itself, not its like, since arrays have no hash."""
+
+    bank: ModeBank
+
+    def __hash__(self) -> int:
+        return id(self.bank)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.bank is self.bank
+
+
+@functools.lru_cache(maxsize=64)
+def _even_model(bank: _Same, step_s: float, covariance: bytes) -> JumpMarkovModel:
+    """The model of steps of one length, which blocks have in common."""
+    n_x = len(bank.bank.state_names)
+    initial = np.frombuffer(covariance).reshape(n_x, n_x)
+    return bank.bank.discretise(np.array([step_s]), np.zeros(n_x), initial)
+
+
 class _Block:
     """The state of a block on its way through the spans."""
 
@@ -129,7 +161,7 @@ class _Block:
         self._task = task
         self._case: Case = experiment.cases[task.case]
         self._n_steps = len(self._case.times_s) - 1
-        self._lanes = LANE_GROUP * -(-task.runs // LANE_GROUP)
+        self._lanes = WIDTH * -(-task.runs // WIDTH)  # the recursion takes whole vectors
         assert self._lanes <= BLOCK_RUNS
         self._simulation = BlockSimulation(
             self._case,
@@ -142,10 +174,20 @@ class _Block:
         self._step_s = step_lengths(self._case.times_s)
         self._even = bool((self._step_s == self._step_s[0]).all())
         self._running: dict[str, Running] = {}
-        self._steps: dict[Series, Moments] = {}
-        self._sums: dict[Cell, tuple[Array, Array]] = {}
-        self._status: dict[str, NDArray[np.int64]] = {RAW: np.zeros(task.runs, dtype=np.int64)}
+        self._sheet = blank_sheet(SPAN_STEPS, self._lanes)
+        self._tallies: dict[str, Tally] = {}
+        self._shares = {
+            name: Moments(*(np.zeros(self._n_steps) for _ in range(3)))
+            for name in experiment.truth_modes
+        }
+        labels = (RAW, *(chosen.label for chosen in experiment.estimators))
+        self._status = {label: np.zeros(task.runs, dtype=np.int64) for label in labels}
         self._tracks: dict[tuple[int, str, str], Array] = {}
+        self._held: NDArray[np.bool_] | None = None
+        fixed, everything = self._simulation.fixed, slice(0, self._n_steps)
+        if fixed is not None:
+            self._held = self._windows(everything, fixed)
+            self._note_shares(everything, fixed)
 
     def run(self, stop: threading.Event) -> BlockResult:
         for span in spans(self._n_steps, SPAN_STEPS):
@@ -154,9 +196,33 @@ class _Block:
             scans = self._simulation.advance(span)
             if not self._running:
                 self._start(scans)
-            self._advance(span, scans)
-        tracks = [Track(*key, values) for key, values in self._tracks.items()]
-        return BlockResult(self._task, self._steps, self._sums, self._status, tracks)
+            if self._held is None:
+                self._note_shares(span, scans.truth)
+            self._keep_truth(span, scans)
+            used = max(self._first_step - span.start, 0)  # scans of a two-point start
+            if used:
+                span, scans = slice(span.start + used, span.stop), scans.cut(slice(used, None))
+            if span.start < span.stop:
+                self._advance(span, scans)
+        return self._result()
+
+    def _result(self) -> BlockResult:
+        steps: dict[Series, Moments] = {
+            (TRUTH, f"mode_probability:{name}"): moments for name, moments in self._shares.items()
+        }
+        sums: dict[Cell, tuple[Array, Array]] = {}
+        for label in self._status:  # in the scenario's order
+            if label in self._tallies:
+                tally = self._tallies[label]
+                steps |= {(label, quantity): moments for quantity, moments in tally.steps()}
+                sums |= {(label, *cell): totals for cell, totals in tally.sums()}
+        kept = sorted(self._tracks.items(), key=lambda item: self._place(item[0][1]))
+        tracks = [Track(*key, values) for key, values in kept]
+        return BlockResult(self._task, steps, sums, self._status, tracks)
+
+    def _place(self, label: str) -> int:
+        """A label's place in the scenario's order; truth and measurements come first."""
+        return [*self._status].index(label) if label in self._status else -1
 
     # ---- the filters' start ----
 
@@ -181,11 +247,20 @@ class _Block:
                 noise = self._simulation.initial_estimate_noise(len(states))
                 mean += square_root(initial.covariance) @ noise
         self._initial_covariances = covariances
-        self._even_models = self._models(self._step_s[:1])
-        for chosen in experiment.estimators:
+        self._even_models = {
+            chosen.label: _even_model(
+                _Same(chosen.bank),
+                float(self._step_s[0]),
+                np.ascontiguousarray(covariances[id(chosen.bank)], dtype=np.float64).tobytes(),
+            )
+            for chosen in experiment.estimators
+        }
+        # The one that others are compared with goes first, so that its scores are at hand.
+        for chosen in sorted(
+            experiment.estimators, key=lambda c: c.label != experiment.compare_with
+        ):
             model = self._even_models[chosen.label]
             self._running[chosen.label] = Running(chosen.estimator, chosen.settings, model, mean)
-            self._status[chosen.label] = np.zeros(self._task.runs, dtype=np.int64)
 
     def _models(self, step_s: Array) -> dict[str, JumpMarkovModel]:
         """Each estimator's model for the given steps; estimators of one bank share it."""
@@ -201,59 +276,80 @@ class _Block:
     # ---- one span ----
 
     def _advance(self, span: slice, scans: Scans) -> None:
-        experiment = self._experiment
-        times_s = self._case.times_s[span.start + 1 : span.stop + 1]
-        masks = {
-            window.name: inside(window, times_s, span.start, scans.truth)
-            for window in experiment.windows
-        }
-        known = self._simulation.state_names
-        self._score_truth(span, scans)
-        skipped = max(self._first_step - span.start, 0)  # scans used up by a two-point start
-        for quantity, values in score_measurements(scans, known).items():
-            values[:skipped] = np.nan
-            self._take(span, RAW, quantity, values, masks)
-        models = self._even_models
-        if not self._even:
-            models = self._models(self._step_s[span.start + skipped : span.stop])
-        advantages: dict[str, Array] = {}
+        """Filter and score scans that none of the filters started from."""
+        held = self._windows(span, scans.truth) if self._held is None else self._held[span]
+        self._score(span, RAW, scans, held, as_measured(scans.measurements))
+        models = self._even_models if self._even else self._models(self._step_s[span])
+        covariance = self._task.tracks > 0
         for label, running in self._running.items():
-            estimates = running.advance(
-                models[label],
-                np.ascontiguousarray(scans.measurements[skipped:]),
-                covariance=self._task.tracks > 0,
-            )
-            estimates = _padded(estimates, skipped)
+            estimates = running.advance(models[label], scans.measurements, covariance=covariance)
             self._note_status(span, label, estimates)
-            names = Names(known, experiment.truth_modes, running.state_names, running.mode_names)
-            scores = score(scans, estimates, names)
-            for quantity, values in scores.quantities.items():
-                self._take(span, label, quantity, values, masks)
-            if scores.likelihood_advantage is not None:
-                advantages[label] = scores.likelihood_advantage
-            if len(running.mode_names) > 1:
-                for j, name in enumerate(running.mode_names):
-                    probabilities = estimates.mode_probabilities[:, j]
-                    self._take(span, label, f"mode_probability:{name}", probabilities)
-                    if estimates.mode_likelihoods.shape[0]:
-                        likelihoods = np.ascontiguousarray(estimates.mode_likelihoods[:, j])
-                        likelihoods[np.isnan(scans.measurements).any(axis=1)] = np.nan
-                        self._take(span, label, f"mode_likelihood:{name}", likelihoods)
+            self._score(span, label, scans, held, estimates)
             self._keep_estimates(span, label, running, estimates)
-        reference = advantages.get(experiment.compare_with or "")
-        if reference is not None:
-            for label, advantage in advantages.items():
-                kept = advantage_kept(advantage, reference)
-                self._take(span, label, "likelihood_advantage_kept", kept, masks)
 
-    def _score_truth(self, span: slice, scans: Scans) -> None:
-        for j, name in enumerate(self._experiment.truth_modes):
-            share = np.repeat(
-                (scans.truth.mode == j).astype(np.float64),
-                self._lanes // scans.truth.mode.shape[1],
-                axis=1,
-            )
-            self._take(span, TRUTH, f"mode_probability:{name}", share)
+    def _score(
+        self,
+        span: slice,
+        label: str,
+        scans: Scans,
+        held: NDArray[np.bool_],
+        estimates: Estimates,
+    ) -> None:
+        if label not in self._tallies:
+            self._tallies[label] = self._begin_tally(label, estimates)
+        self._tallies[label].add(span.start, scans, held, estimates)
+
+    def _begin_tally(self, label: str, estimates: Estimates) -> Tally:
+        experiment, running = self._experiment, self._running.get(label)
+        names = Names(
+            self._simulation.state_names,
+            experiment.truth_modes,
+            running.state_names if running else tuple("xyz"[: estimates.mean.shape[1]]),
+            running.mode_names if running else (),
+        )
+        leading = self._tallies.get(experiment.compare_with or "")
+        return Tally(
+            names,
+            self._n_steps,
+            tuple(window.name for window in experiment.windows),
+            self._sheet,
+            self._task.runs,
+            likelihoods=len(estimates.mode_likelihoods) > 0,
+            leads=label == experiment.compare_with,
+            compared=leading is not None and leading.has_advantage,
+        )
+
+    def _windows(self, span: slice, truth: TruthSpan) -> NDArray[np.bool_]:
+        """Which windows hold a span's steps (n_steps, n_windows, lanes or 1)."""
+        times_s = self._case.times_s[span.start + 1 : span.stop + 1]
+        windows = self._experiment.windows
+        return np.stack([inside(w, times_s, span.start, truth) for w in windows], axis=1)
+
+    def _note_shares(self, span: slice, truth: TruthSpan) -> None:
+        """Moments of the truth's being in each of its modes."""
+        runs = self._task.runs
+        for j, moments in enumerate(self._shares.values()):
+            share = (truth.mode[:, :runs] == j).mean(axis=1)
+            moments.n[span] = runs
+            moments.mean[span] = share
+            moments.squares[span] = runs * share * (1.0 - share)
+
+    def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
+        """Note the step at which a run diverges; from there on its estimates are NaN."""
+        if all_below(estimates.mean, DIVERGED):
+            return
+        status = self._status[label]
+        sound = np.abs(estimates.mean).max(axis=1) < DIVERGED
+        for b in np.flatnonzero(~sound.all(axis=0)):
+            first = int(np.argmin(sound[:, b]))
+            if b < self._task.runs and status[b] == 0:
+                status[b] = span.start + first + 1
+            for array in estimates:
+                array[first:, ..., b] = np.nan
+
+    # ---- tracks of the first runs ----
+
+    def _keep_truth(self, span: slice, scans: Scans) -> None:
         if not self._task.tracks:
             return
         for e, name in enumerate(self._simulation.state_names):
@@ -262,44 +358,6 @@ class _Block:
             self._keep(span, TRUTH, "mode", scans.truth.mode.astype(np.float64))
         for m in range(scans.measurements.shape[1]):
             self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
-
-    def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
-        """Note the step at which a run diverges; from there on its estimates are NaN."""
-        begin = max(self._first_step - span.start, 0)
-        status = self._status[label]
-        mean = estimates.mean[begin:]
-        if mean.max(initial=0.0) < DIVERGED and mean.min(initial=0.0) > -DIVERGED:
-            return  # nearly always; NaN isn't below anything
-        sound = np.abs(mean).max(axis=1) < DIVERGED
-        for b in np.flatnonzero(~sound.all(axis=0)):
-            first = begin + int(np.argmin(sound[:, b]))
-            if b < self._task.runs and status[b] == 0:
-                status[b] = span.start + first + 1
-            for array in estimates:
-                array[first:, ..., b] = np.nan
-
-    def _take(
-        self,
-        span: slice,
-        label: str,
-        quantity: str,
-        values: Array,
-        masks: dict[str, NDArray[np.bool_]] | None = None,
-    ) -> None:
-        """Add a span of a quantity (n_steps, lanes) to the statistics."""
-        runs = self._task.runs
-        if quantity != POSITION_AT_SCANS:
-            key = (label, quantity)
-            if key not in self._steps:
-                self._steps[key] = Moments(*(np.zeros(self._n_steps) for _ in range(3)))
-            accumulate_steps(values, runs, *(array[span] for array in self._steps[key]))
-        for window, mask in (masks or {}).items():
-            cell = (label, window, quantity)
-            if cell not in self._sums:
-                self._sums[cell] = (np.zeros(runs), np.zeros(runs))
-            accumulate_window(values, mask, runs, *self._sums[cell])
-
-    # ---- tracks of the first runs ----
 
     def _keep_estimates(
         self, span: slice, label: str, running: Running, estimates: Estimates
@@ -321,14 +379,3 @@ class _Block:
             if key not in self._tracks:
                 self._tracks[key] = np.full(self._n_steps, np.nan)
             self._tracks[key][span] = values[:, run if values.shape[1] > 1 else 0]
-
-
-def _padded(estimates: Estimates, skipped: int) -> Estimates:
-    """NaN in front, for scans that have no estimate yet."""
-    if not skipped:
-        return estimates
-    padded = []
-    for array in estimates:
-        front = np.full((skipped if len(array) else 0, *array.shape[1:]), np.nan)
-        padded.append(np.concatenate([front, array]))
-    return Estimates(*padded)

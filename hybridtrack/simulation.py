@@ -120,6 +120,10 @@ class TruthSpan(NamedTuple):
     mode: Modes  # (n_steps, lanes or 1), -1 where there is none
     since_switch_s: Array  # (n_steps, lanes or 1) since the last switch of mode; inf before it
 
+    def cut(self, steps: slice) -> "TruthSpan":
+        """Some of the steps."""
+        return TruthSpan(self.state[steps], self.mode[steps], self.since_switch_s[steps])
+
 
 @kernel
 def _draw_modes(mode, uniform, cumulative, out):
@@ -135,18 +139,26 @@ def _draw_modes(mode, uniform, cumulative, out):
 
 @kernel
 def _drive(state, modes, noise, state_transition, input_effect, noise_root, out):
+    """x <- F_j x + b_j + L_j w, j the mode of each lane, every mode's in turn: rows of lanes."""
     n_x, lanes = state.shape
+    row = np.empty(lanes)
     for k in range(modes.shape[0]):
         f = k if state_transition.shape[0] > 1 else 0
-        for a in range(n_x):
-            for b in range(lanes):
-                j = modes[k, b]
-                value = input_effect[f, j, a]
+        before = out[k - 1] if k > 0 else state
+        for j in range(state_transition.shape[1]):
+            for a in range(n_x):
+                row[:] = input_effect[f, j, a]
                 for e in range(n_x):
-                    value += state_transition[f, j, a, e] * state[e, b]
-                    value += noise_root[f, j, a, e] * noise[k, e, b]
-                out[k, a, b] = value
-        state[:] = out[k]
+                    transition, root = state_transition[f, j, a, e], noise_root[f, j, a, e]
+                    if transition != 0.0:
+                        for b in range(lanes):
+                            row[b] += transition * before[e, b]
+                    if root != 0.0:
+                        for b in range(lanes):
+                            row[b] += root * noise[k, e, b]
+                for b in range(lanes):
+                    out[k, a, b] = row[b] if modes[k, b] == j else out[k, a, b]
+    state[:] = out[-1]
 
 
 def square_root(covariance: Array) -> Array:
@@ -173,6 +185,10 @@ class Scans(NamedTuple):
     truth: TruthSpan
     measurements: Array  # (n_steps, n_y, lanes), NaN where missed
 
+    def cut(self, steps: slice) -> "Scans":
+        """Some of the steps."""
+        return Scans(self.truth.cut(steps), self.measurements[steps])
+
 
 class Case(NamedTuple):
     """One truth with its own times; an experiment has one or more."""
@@ -183,10 +199,14 @@ class Case(NamedTuple):
     recorded: Array | None = None  # (n_steps + 1, n_y): measurements as recorded, no sensor drawn
 
 
-def spans(n_steps: int, length: int) -> Iterator[slice]:
-    """Steps 0 .. n_steps cut into spans of the given length."""
-    for begin in range(0, n_steps, length):
-        yield slice(begin, min(begin + length, n_steps))
+def spans(n_steps: int, longest: int) -> Iterator[slice]:
+    """Steps 0 .. n_steps cut into as few spans as can be, of one length or nearly so.
+
+    What is kept from span to span need not be allocated anew for a short last one.
+    """
+    number = -(-n_steps // longest)
+    for i in range(number):
+        yield slice(i * n_steps // number, (i + 1) * n_steps // number)
 
 
 def step_lengths(times_s: Array) -> Array:
@@ -207,17 +227,22 @@ class BlockSimulation:
         self._lanes = lanes
         self._case = case
         self._sensor = sensor
-        self._streams = {purpose: stream(seed, case_index, block, purpose) for purpose in Purpose}
+        self._key = (seed, case_index, block)
+        self._streams: dict[Purpose, np.random.Generator] = {}
         self._noise_root = square_root(sensor.noise_covariance)
+        axes = np.diagonal(self._noise_root, axis1=1, axis2=2)[..., np.newaxis]  # (n_modes, n_y, 1)
+        alone = len(axes) == 1 and not np.any(self._noise_root[0] - np.diag(axes[0, :, 0]))
+        self._noise_std = axes[0] if alone else None  # where axes are independent of one another
+        self.fixed: TruthSpan | None = None  # the truth of all steps, if every run has the same
         truth = case.truth
         if isinstance(truth, ChainTruth):
             self.state_names = truth.bank.state_names
             n_x = len(self.state_names)
-            draws = self._streams[Purpose.INITIAL_STATE].standard_normal((n_x, BLOCK_RUNS))
+            draws = self._stream(Purpose.INITIAL_STATE).standard_normal((n_x, BLOCK_RUNS))
             self._state = truth.initial_mean[:, None] + (
                 square_root(truth.initial_covariance) @ draws
             )
-            uniform = self._streams[Purpose.MODE_SEQUENCE].random(BLOCK_RUNS)
+            uniform = self._stream(Purpose.MODE_SEQUENCE).random(BLOCK_RUNS)
             cumulative = np.cumsum(truth.bank.initial_mode_probabilities)[:-1]
             self._mode: Modes = np.searchsorted(cumulative, uniform, side="right")
             self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
@@ -226,14 +251,25 @@ class BlockSimulation:
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
-            self._since_switch_s = _since_switch(case.times_s, truth.mode)
+            since_switch_s = _since_switch(case.times_s, truth.mode)
+            self.fixed = TruthSpan(
+                truth.state[1:, :, np.newaxis],
+                truth.mode[1:, np.newaxis],
+                since_switch_s[1:, np.newaxis],
+            )
         self._positions = [
             self.state_names.index(axis) for axis in "xy" if axis in self.state_names
         ]
 
+    def _stream(self, purpose: Purpose) -> np.random.Generator:
+        """The purpose's stream, begun when first asked for: most cases need few of them."""
+        if purpose not in self._streams:
+            self._streams[purpose] = stream(*self._key, purpose)
+        return self._streams[purpose]
+
     def initial_estimate_noise(self, n_x: int) -> Array:
         """Standard normal draws (n_x, lanes) for a start drawn about the truth."""
-        draws = self._streams[Purpose.INITIAL_ESTIMATE].standard_normal((n_x, BLOCK_RUNS))
+        draws = self._stream(Purpose.INITIAL_ESTIMATE).standard_normal((n_x, BLOCK_RUNS))
         return draws[:, : self._lanes]
 
     def advance(self, span: slice) -> Scans:
@@ -254,10 +290,11 @@ class BlockSimulation:
         if self._case.recorded is not None:
             scans = self._case.recorded[span.start + 1 : span.stop + 1, :, np.newaxis]
             return Scans(truth, np.repeat(scans, BLOCK_RUNS, axis=2))
-        draws = self._streams[Purpose.MEASUREMENT_NOISE].standard_normal((steps, n_y, BLOCK_RUNS))
-        measurements = truth.state[:, self._positions] + self._shape_noise(draws, truth.mode)
+        draws = self._stream(Purpose.MEASUREMENT_NOISE).standard_normal((steps, n_y, BLOCK_RUNS))
+        measurements = self._shape_noise(draws, truth.mode)
+        measurements += truth.state[:, self._positions]
         if self._sensor.detection_probability < 1.0:
-            uniform = self._streams[Purpose.DETECTION].random((steps, BLOCK_RUNS))
+            uniform = self._stream(Purpose.DETECTION).random((steps, BLOCK_RUNS))
             missed = uniform >= self._sensor.detection_probability
             missed[: max(self._sensor.certain_scans - span.start, 0)] = False
             measurements[np.repeat(missed[:, np.newaxis], n_y, axis=1)] = np.nan
@@ -265,10 +302,10 @@ class BlockSimulation:
 
     def _shape_noise(self, draws: Array, modes: Modes) -> Array:
         root = self._noise_root
+        if self._noise_std is not None:
+            draws *= self._noise_std
+            return draws
         if len(root) == 1:
-            if not np.any(root[0] - np.diag(np.diagonal(root[0]))):
-                draws *= np.diagonal(root[0])[:, np.newaxis]
-                return draws
             shaped: Array = np.einsum("ml,klb->kmb", root[0], draws)
         else:
             by_run = root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))]
@@ -276,21 +313,17 @@ class BlockSimulation:
         return shaped
 
     def _advance_truth(self, span: slice) -> TruthSpan:
+        if self.fixed is not None:
+            return self.fixed.cut(span)
         truth = self._case.truth
-        here = slice(span.start + 1, span.stop + 1)
-        if isinstance(truth, FixedTruth):
-            return TruthSpan(
-                truth.state[here, :, np.newaxis],
-                truth.mode[here, np.newaxis],
-                self._since_switch_s[here, np.newaxis],
-            )
+        assert isinstance(truth, ChainTruth)
         model = truth_model(truth, self._step_s[span])
         steps, n_x = span.stop - span.start, len(self.state_names)
-        uniform = self._streams[Purpose.MODE_SEQUENCE].random((steps, BLOCK_RUNS))
+        uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
         modes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
         before = self._mode.copy()
         _draw_modes(self._mode, uniform, np.cumsum(model.transition_matrix, axis=-1), modes)
-        noise = self._streams[Purpose.PROCESS_NOISE].standard_normal((steps, n_x, BLOCK_RUNS))
+        noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, n_x, BLOCK_RUNS))
         state = np.empty((steps, n_x, BLOCK_RUNS))
         root = np.ascontiguousarray(square_root(model.process_noise_covariance))
         arguments: tuple[Any, ...] = (model.state_transition, model.input_effect, root, state)

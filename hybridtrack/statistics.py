@@ -12,10 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridtrack.compiled import kernel
-from hybridtrack.estimators import Estimates
 from hybridtrack.models import Array
-from hybridtrack.simulation import Modes, Scans, TruthSpan
 
 
 class Metric(NamedTuple):
@@ -63,147 +60,9 @@ METRICS: Mapping[str, Metric] = {
     ),
 }
 
-ROUNDING = 1e-9  # likelihoods sum to 1; two filters that are one in theory differ by less
-
 # The position error at the scans that were not missed: what compares with the measurements.
 POSITION, POSITION_AT_SCANS = "position_squared_error_m2", "position_squared_error_at_scans_m2"
 QUANTITIES = (*dict.fromkeys(metric.quantity for metric in METRICS.values()), POSITION_AT_SCANS)
-
-
-# ---- one span scored -------------------------------------------------------------------------
-
-
-class Names(NamedTuple):
-    """Names that tell which quantities exist."""
-
-    truth_states: tuple[str, ...]
-    truth_modes: tuple[str, ...]  # () where the truth has none
-    states: tuple[str, ...]  # the estimator's
-    modes: tuple[str, ...]  # the estimator's; one mode has no probabilities to score
-
-
-class Scores(NamedTuple):
-    """What a span of estimates is worth: arrays (n_steps, lanes), NaN where not defined."""
-
-    quantities: dict[str, Array]
-    likelihood_advantage: Array | None  # of the true mode over the best of the others
-
-
-def squared_error(
-    truth: Array, truth_states: tuple[str, ...], estimate: Array, states: tuple[str, ...], kind: str
-) -> Array | None:
-    """Squared norm of the vector error over the axes that both know; kind '' or 'v'.
-
-    NaN where the estimate isn't finite, infinite where only its square isn't.
-    """
-    axes = [kind + axis for axis in "xyz" if kind + axis in truth_states and kind + axis in states]
-    if not axes:
-        return None
-    total = np.zeros((estimate.shape[0], estimate.shape[2]))
-    for name in axes:
-        difference = estimate[:, states.index(name)] - truth[:, truth_states.index(name)]
-        difference[np.isinf(difference)] = np.nan
-        with np.errstate(over="ignore"):
-            difference *= difference
-            total += difference
-    return total
-
-
-def score_measurements(scans: Scans, truth_states: tuple[str, ...]) -> dict[str, Array]:
-    """The raw measurements' own error, by the quantities that they have."""
-    states = tuple("xyz"[: scans.measurements.shape[1]])
-    error = squared_error(scans.truth.state, truth_states, scans.measurements, states, "")
-    return {} if error is None else {POSITION: error, POSITION_AT_SCANS: error}
-
-
-def score(scans: Scans, estimates: Estimates, names: Names) -> Scores:
-    """Quantities of a span of estimates, by name; absent where the names don't carry them."""
-    quantities: dict[str, Array] = {}
-    for kind, quantity in (("", POSITION), ("v", "velocity_squared_error_m2_s2")):
-        error = squared_error(
-            scans.truth.state, names.truth_states, estimates.mean, names.states, kind
-        )
-        if error is not None:
-            quantities[quantity] = error
-    if POSITION in quantities:
-        missed = np.isnan(scans.measurements).any(axis=1)
-        quantities[POSITION_AT_SCANS] = np.where(missed, np.nan, quantities[POSITION])
-    if len(names.modes) < 2:
-        return Scores(quantities, None)
-    steps, _, lanes = estimates.mode_probabilities.shape
-    out = np.empty((5, steps, lanes))
-    true_mode = _true_mode(scans.truth, names)
-    arguments = (estimates.mode_probabilities, estimates.mode_likelihoods, scans.measurements)
-    score_modes(*arguments, true_mode, out)
-    if estimates.mode_likelihoods.shape[0]:
-        quantities["likelihood_distinctness"] = out[3]
-    if not set(names.truth_modes) & set(names.modes):
-        return Scores(quantities, None)
-    quantities["mode_correct"] = out[0]
-    quantities["mode_brier"] = out[1]
-    quantities["true_mode_probability"] = out[2]
-    return Scores(quantities, out[4] if estimates.mode_likelihoods.shape[0] else None)
-
-
-def _true_mode(truth: TruthSpan, names: Names) -> Modes:
-    """The true mode (n_steps, lanes or 1) as an index into the estimator's; -1 where none is."""
-    table = [names.modes.index(n) if n in names.modes else -1 for n in names.truth_modes]
-    index: Modes = np.array([*table, -1])[truth.mode]  # -1, no true mode, finds the last entry
-    return np.ascontiguousarray(index)
-
-
-@kernel
-def score_modes(probabilities, likelihoods, measurements, true_mode, out):
-    """Correct (0 or 1), Brier score, probability of the true mode, distinctness, advantage.
-
-    out (5, n_steps, lanes). NaN where the true mode is unknown, where an estimate isn't finite,
-    and for the last two where the scan is missing or there are no likelihoods.
-    """
-    n_steps, n_modes, lanes = probabilities.shape
-    for k in range(n_steps):
-        for b in range(lanes):
-            j = true_mode[k, b if true_mode.shape[1] > 1 else 0]
-            best = 0
-            brier = 0.0
-            total = 0.0
-            for i in range(n_modes):
-                p = probabilities[k, i, b]
-                total += p
-                brier += 0.5 * (p - (1.0 if i == j else 0.0)) ** 2
-                if p > probabilities[k, best, b]:
-                    best = i
-            unknown = j < 0 or total != total
-            out[0, k, b] = np.nan if unknown else (1.0 if best == j else 0.0)
-            out[1, k, b] = np.nan if unknown else brier
-            out[2, k, b] = np.nan if unknown else probabilities[k, j, b]
-            missed = likelihoods.shape[0] == 0
-            for m in range(measurements.shape[1]):
-                missed = missed or measurements[k, m, b] != measurements[k, m, b]
-            out[3, k, b] = np.nan
-            out[4, k, b] = np.nan
-            if not missed:
-                first = -np.inf
-                second = -np.inf
-                others = -np.inf
-                for i in range(n_modes):
-                    value = likelihoods[k, i, b]
-                    if value > first:
-                        second = first
-                        first = value
-                    elif value > second:
-                        second = value
-                    if i != j and value > others:
-                        others = value
-                out[3, k, b] = first - second
-                if not unknown:
-                    out[4, k, b] = likelihoods[k, j, b] - others
-
-
-def advantage_kept(own: Array, reference: Array) -> Array:
-    """1 where the true mode leads by at least as much as under the reference, 0 where less."""
-    kept = (own >= reference - ROUNDING).astype(np.float64)
-    kept[np.isnan(own) | np.isnan(reference)] = np.nan
-    return kept
 
 
 # ---- running moments -------------------------------------------------------------------------
@@ -250,37 +109,6 @@ def merge_sum_moments(a: SumMoments, b: SumMoments) -> SumMoments:
         a.products + b.products + weight * step * other,
         a.number_squares + b.number_squares + weight * other**2,
     )
-
-
-@kernel
-def accumulate_steps(values, runs, count, mean, squares):
-    """Moments over the first `runs` lanes at each step; values (n_steps, lanes), NaN left out."""
-    for k in range(values.shape[0]):
-        n = 0.0
-        total = 0.0
-        for b in range(runs):
-            present = values[k, b] == values[k, b]
-            n += 1.0 if present else 0.0
-            total += values[k, b] if present else 0.0
-        centre = total / n if n > 0.0 else 0.0
-        deviation = 0.0
-        for b in range(runs):
-            d = values[k, b] - centre if values[k, b] == values[k, b] else 0.0
-            deviation += d * d
-        count[k] = n
-        mean[k] = centre
-        squares[k] = deviation
-
-
-@kernel
-def accumulate_window(values, inside, runs, sums, numbers):
-    """Sums and numbers of steps per run; inside (n_steps, lanes or 1), NaN left out."""
-    for k in range(values.shape[0]):
-        for b in range(runs):
-            here = inside[k, b if inside.shape[1] > 1 else 0]
-            if here and values[k, b] == values[k, b]:
-                sums[b] += values[k, b]
-                numbers[b] += 1.0
 
 
 def sum_moments(sums: Array, numbers: Array, sound: NDArray[np.bool_]) -> SumMoments:

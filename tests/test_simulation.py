@@ -255,6 +255,15 @@ def test_the_start_of_estimates_doesnt_depend_on_lanes():
     assert draws[1].tobytes() == draws[0][:, :3].tobytes()
 
 
+@pytest.mark.parametrize(
+    ("steps", "lengths"), [(7, [7]), (50, [50]), (51, [25, 26]), (150, [50] * 3), (0, [])]
+)
+def test_spans_are_few_and_of_nearly_one_length(steps, lengths):
+    cut = list(spans(steps, 50))
+    assert [span.stop - span.start for span in cut] == lengths
+    assert [k for span in cut for k in range(span.start, span.stop)] == list(range(steps))
+
+
 def test_streams_differ_by_seed_case_block_and_purpose():
     keys = list(itertools.product((0, 1), (0, 1), (0, 1), Purpose))
     draws = {stream(*key).random(4).tobytes() for key in keys}

@@ -1,4 +1,4 @@
-"""Scores against plain loops, merged moments against direct ones, errors against resampling."""
+"""Merged moments against direct ones, errors against resampling."""
 
 import functools
 import math
@@ -9,264 +9,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridtrack.estimators import Estimates
-from hybridtrack.simulation import Scans, TruthSpan
 from hybridtrack.statistics import (
     METRICS,
     POSITION_AT_SCANS,
     QUANTITIES,
     Moments,
-    Names,
     RunSums,
     SumMoments,
-    accumulate_steps,
-    accumulate_window,
-    advantage_kept,
     compare,
     merge_moments,
     merge_pairs,
     merge_sum_moments,
     pair_moments,
     ratio_of_sums,
-    score,
-    score_measurements,
-    squared_error,
     sum_moments,
 )
 
 ROUNDING = 1e-12  # relative: some 1e2 operations of 1e-16, a margin of 100
 SIGMAS = 4.0  # standard errors allowed to a Monte Carlo figure: 6e-5 each, and the seeds are fixed
-
-
-# ---- scores ----------------------------------------------------------------------------------
-
-TRUTH_STATES = ("x", "vx", "y", "vy")
-
-
-def span(rng, *, n_modes=2, steps=6, lanes=5, truth_lanes=None, states=6, likelihoods=True):
-    """A span of scans and of estimates, all random."""
-    wide = lanes if truth_lanes is None else truth_lanes
-    truth = TruthSpan(
-        rng.normal(size=(steps, 4, wide)),
-        rng.integers(0, n_modes, size=(steps, wide)),
-        np.full((steps, wide), np.inf),
-    )
-    probabilities, weights = rng.random((2, steps, n_modes, lanes))
-    estimates = Estimates(
-        mean=rng.normal(size=(steps, states, lanes)),
-        mode_probabilities=probabilities / probabilities.sum(axis=1, keepdims=True),
-        mode_likelihoods=(weights / weights.sum(axis=1, keepdims=True))[: steps * likelihoods],
-        covariance=np.empty((0, 0, lanes)),
-    )
-    return Scans(truth, rng.normal(size=(steps, 2, lanes))), estimates
-
-
-def slow_scores(scans, estimates, names):
-    """Every quantity of one run and one step, run by run, step by step, mode by mode."""
-    steps, _, lanes = estimates.mean.shape
-    found = {}
-
-    def note(quantity, k, run, value):
-        found.setdefault(quantity, np.full((steps, lanes), np.nan))[k, run] = value
-
-    for k in range(steps):
-        for run in range(lanes):
-            here = min(run, scans.truth.state.shape[2] - 1)
-            truth = dict(zip(names.truth_states, scans.truth.state[k, :, here], strict=True))
-            ours = dict(zip(names.states, estimates.mean[k, :, run], strict=True))
-            for quantity, states in (
-                ("position_squared_error_m2", ("x", "y")),
-                ("velocity_squared_error_m2_s2", ("vx", "vy")),
-            ):
-                shared = [s for s in states if s in truth and s in ours]
-                if shared and all(math.isfinite(ours[s]) for s in shared):
-                    note(quantity, k, run, sum((ours[s] - truth[s]) ** 2 for s in shared))
-            if "position_squared_error_m2" in found:
-                missed = np.isnan(scans.measurements[k, :, run]).any()
-                error = found["position_squared_error_m2"][k, run]
-                note(POSITION_AT_SCANS, k, run, math.nan if missed else error)
-            p = dict(zip(names.modes, estimates.mode_probabilities[k, :, run], strict=True))
-            j = scans.truth.mode[k, here]
-            mode = names.truth_modes[j] if j >= 0 else None
-            known = mode in p and not any(math.isnan(v) for v in p.values())
-            if known:
-                note("mode_correct", k, run, float(max(p, key=p.get) == mode))
-                half = sum((v - (name == mode)) ** 2 for name, v in p.items()) / 2
-                note("mode_brier", k, run, half)
-                note("true_mode_probability", k, run, p[mode])
-            if (
-                len(estimates.mode_likelihoods)
-                and not np.isnan(scans.measurements[k, :, run]).any()
-            ):
-                values = dict(zip(names.modes, estimates.mode_likelihoods[k, :, run], strict=True))
-                first, second = sorted(values.values(), reverse=True)[:2]
-                note("likelihood_distinctness", k, run, first - second)
-                if known:
-                    best_other = max(v for name, v in values.items() if name != mode)
-                    note("advantage", k, run, values[mode] - best_other)
-    return found
-
-
-def assert_scores(scans, estimates, names):
-    ours, expected = score(scans, estimates, names), slow_scores(scans, estimates, names)
-    advantage = expected.pop("advantage", None)
-    assert set(ours.quantities) == set(expected)
-    for quantity, values in expected.items():
-        np.testing.assert_allclose(ours.quantities[quantity], values, ROUNDING, ROUNDING)
-    assert (ours.likelihood_advantage is None) == (advantage is None)
-    if advantage is not None:
-        np.testing.assert_allclose(ours.likelihood_advantage, advantage, ROUNDING, ROUNDING)
-
-
-SIX_STATES = ("x", "vx", "ax", "y", "vy", "ay")
-
-
-@pytest.mark.parametrize("truth_lanes", [None, 1])
-@pytest.mark.parametrize("likelihoods", [True, False])
-@pytest.mark.parametrize(
-    ("truth_modes", "modes"),
-    [
-        (("a", "b"), ("a", "b")),
-        (("a", "b"), ("b", "a")),
-        (("a", "b", "c"), ("c", "a", "b")),
-        (("a", "b", "c"), ("d", "b")),  # a and c are unknown to the estimator, d never occurs
-    ],
-)
-@pytest.mark.parametrize("states", [SIX_STATES, ("vy", "ax", "y", "x", "ay", "vx")])
-def test_scores_are_those_of_plain_loops(states, truth_modes, modes, likelihoods, truth_lanes):
-    rng = np.random.default_rng(1)
-    scans, estimates = span(rng, n_modes=3, truth_lanes=truth_lanes, likelihoods=likelihoods)
-    scans = scans._replace(truth=scans.truth._replace(mode=scans.truth.mode % len(truth_modes)))
-    estimates = estimates._replace(
-        mode_probabilities=estimates.mode_probabilities[:, : len(modes)],
-        mode_likelihoods=estimates.mode_likelihoods[:, : len(modes)],
-    )
-    assert_scores(scans, estimates, Names(TRUTH_STATES, truth_modes, states, modes))
-
-
-def test_scores_in_a_hand_case():
-    truth = TruthSpan(
-        np.array([1.0, 2.0, 3.0, 4.0]).reshape(1, 4, 1), np.array([[1]]), np.array([[np.inf]])
-    )
-    estimates = Estimates(
-        np.array([7.0, 4.0, 4.0, 3.0, 0.0, 0.0]).reshape(1, 6, 1),
-        np.array([0.25, 0.75]).reshape(1, 2, 1),
-        np.array([0.6, 0.4]).reshape(1, 2, 1),
-        np.empty((0, 0, 1)),
-    )
-    states = ("y", "x", "vy", "vx", "ax", "ay")
-    scans = Scans(truth, np.array([2.0, 0.0]).reshape(1, 2, 1))
-    quantities, advantage = score(
-        scans, estimates, Names(TRUTH_STATES, ("a", "b"), states, ("a", "b"))
-    )
-    assert {name: float(value[0, 0]) for name, value in quantities.items()} == {
-        "position_squared_error_m2": 25.0,  # 3-4-5
-        POSITION_AT_SCANS: 25.0,
-        "velocity_squared_error_m2_s2": 1.0,
-        "likelihood_distinctness": pytest.approx(0.2, rel=ROUNDING),
-        "mode_correct": 1.0,
-        "mode_brier": 0.0625,
-        "true_mode_probability": 0.75,
-    }
-    assert advantage is not None
-    assert advantage[0, 0] == pytest.approx(-0.2, rel=ROUNDING)
-    raw = score_measurements(scans, TRUTH_STATES)
-    assert {name: float(value[0, 0]) for name, value in raw.items()} == {
-        "position_squared_error_m2": 10.0,
-        POSITION_AT_SCANS: 10.0,
-    }
-
-
-@pytest.mark.parametrize("n_modes", [2, 3])
-def test_missed_scans_unknown_modes_and_diverged_runs_are_left_out(n_modes):
-    rng = np.random.default_rng(2)
-    scans, estimates = span(rng, n_modes=n_modes)
-    scans.measurements[0, 1, :3] = np.nan  # one component is enough
-    scans.truth.mode[1, 1:4] = -1
-    estimates.mean[2:, 3, 2] = np.nan
-    estimates.mean[3, 4, 3] = np.inf
-    estimates.mode_probabilities[4, :, 0] = np.nan
-    modes = ("a", "b", "c")[:n_modes]
-    assert_scores(scans, estimates, Names(TRUTH_STATES, modes, SIX_STATES, modes))
-
-
-def test_an_error_too_large_to_square_is_infinite_without_a_warning():
-    scans, estimates = span(np.random.default_rng(3))
-    estimates.mean[0, 0, 0] = -1e200
-    names = Names(TRUTH_STATES, (), SIX_STATES, ("a",))
-    assert score(scans, estimates, names).quantities["position_squared_error_m2"][0, 0] == np.inf
-
-
-def test_the_brier_score_and_accuracy_at_their_bounds():
-    scans, estimates = span(np.random.default_rng(4))
-    sure = np.eye(2)[scans.truth.mode].swapaxes(1, 2)
-    names = Names(TRUTH_STATES, ("a", "b"), SIX_STATES, ("a", "b"))
-    right = score(scans, estimates._replace(mode_probabilities=np.ascontiguousarray(sure)), names)
-    wrong = score(scans, estimates._replace(mode_probabilities=1.0 - sure), names)
-    assert (right.quantities["mode_correct"] == 1.0).all()
-    assert (right.quantities["mode_brier"] == 0.0).all()
-    assert (wrong.quantities["mode_correct"] == 0.0).all()
-    assert (wrong.quantities["mode_brier"] == 1.0).all()
-
-
-@pytest.mark.parametrize(
-    ("truth_modes", "modes", "kept"),
-    [
-        ((), ("a", "b"), {"likelihood_distinctness"}),
-        (("c",), ("a", "b"), {"likelihood_distinctness"}),
-        (("a", "b"), ("a",), set()),
-        (("a", "b"), (), set()),
-    ],
-)
-def test_quantities_follow_from_the_names(truth_modes, modes, kept):
-    scans, estimates = span(np.random.default_rng(5))
-    scans = scans._replace(truth=scans.truth._replace(mode=np.full_like(scans.truth.mode, -1)))
-    quantities, advantage = score(
-        scans, estimates, Names(TRUTH_STATES, truth_modes, SIX_STATES, modes)
-    )
-    assert set(quantities) == kept | {
-        "position_squared_error_m2",
-        POSITION_AT_SCANS,
-        "velocity_squared_error_m2_s2",
-    }
-    assert advantage is None
-
-
-def test_a_span_that_misses_every_known_mode_has_the_same_quantities():
-    # Blocks are merged by quantity: none may come and go with the draw.
-    scans, estimates = span(np.random.default_rng(6))
-    names = Names(TRUTH_STATES, ("a", "c"), SIX_STATES, ("a", "b"))
-    unknown = scans._replace(truth=scans.truth._replace(mode=np.ones_like(scans.truth.mode)))
-    quantities, advantage = score(unknown, estimates, names)
-    assert set(quantities) == set(score(scans, estimates, names).quantities)
-    assert np.isnan(quantities["mode_brier"]).all()
-    assert advantage is not None
-    assert np.isnan(advantage).all()
-
-
-def test_vectors_are_compared_on_the_axes_that_both_know():
-    truth, estimate = np.zeros((1, 2, 1)), np.full((1, 2, 1), 3.0)
-    assert squared_error(truth, ("x", "vx"), estimate, ("x", "y"), "").tolist() == [[9.0]]
-    assert squared_error(truth, ("x", "vx"), estimate, ("x", "y"), "v") is None
-    assert squared_error(truth, ("heading", "rate"), estimate, ("heading", "rate"), "") is None
-
-
-def test_raw_errors_are_missing_where_the_scan_is():
-    scans, _ = span(np.random.default_rng(7), truth_lanes=1)
-    scans.measurements[2, 0, 1] = np.nan
-    error = score_measurements(scans, TRUTH_STATES)["position_squared_error_m2"]
-    expected = ((scans.measurements - scans.truth.state[:, [0, 2]]) ** 2).sum(axis=1)
-    np.testing.assert_allclose(error, expected, ROUNDING)
-    assert np.isnan(error).sum() == 1
-    assert score_measurements(scans, ("s0", "s1", "s2", "s3")) == {}
-
-
-def test_an_advantage_is_kept_or_not_or_unknown():
-    # 1e-10 less is rounding between two filters that are one in theory, 1e-8 less is less.
-    own = np.array([0.5, 0.2, 0.3, 0.3 - 1e-10, 0.3 - 1e-8, np.nan, 0.1])
-    reference = np.array([0.4, 0.3, 0.3, 0.3, 0.3, 0.1, np.nan])
-    expected = [1.0, 0.0, 1.0, 1.0, 0.0, np.nan, np.nan]
-    np.testing.assert_array_equal(advantage_kept(own, reference), expected)
 
 
 def test_every_quantity_has_a_metric_that_says_which_way_is_better():
@@ -277,15 +37,6 @@ def test_every_quantity_has_a_metric_that_says_which_way_is_better():
 
 
 # ---- running moments -------------------------------------------------------------------------
-
-
-def step_moments(values, runs=None):
-    """Moments of values (n_steps, lanes) by the kernel."""
-    moments = Moments(*(np.full(len(values), -7.0) for _ in range(3)))
-    accumulate_steps(
-        np.ascontiguousarray(values), values.shape[1] if runs is None else runs, *moments
-    )
-    return moments
 
 
 def slow_moments(values):
@@ -331,34 +82,16 @@ def folded(parts, merge, backwards):
 @given(cut_values(), st.booleans())
 def test_merged_moments_are_those_of_the_whole(case, backwards):
     values, cuts = case
-    parts = [step_moments(part) for part in np.split(values, cuts, axis=1)]
+    parts = [slow_moments(part) for part in np.split(values, cuts, axis=1)]
     # Sums of 60 numbers: rounding, by the size of the values.
     assert_moments(folded(parts, merge_moments, backwards), slow_moments(values), 1e3)
-
-
-def test_moments_take_only_the_runs_that_are_wanted():
-    values = np.random.default_rng(8).normal(size=(4, 32))
-    assert_moments(step_moments(values, runs=9), slow_moments(values[:, :9]), 1.0)
 
 
 def test_moments_of_a_large_mean_keep_their_digits():
     # A sum of squares would lose them all: 1e18 against deviations of 1.
     values = 1e9 + np.arange(6.0).reshape(1, 6)
-    merged = merge_moments(step_moments(values[:, :2]), step_moments(values[:, 2:]))
+    merged = merge_moments(slow_moments(values[:, :2]), slow_moments(values[:, 2:]))
     assert merged.squares[0] == pytest.approx(17.5, rel=1e-6)  # 1e-16 of 1e9 in each deviation
-
-
-@pytest.mark.parametrize("wide", [True, False])
-def test_window_sums_hold_the_steps_inside(wide):
-    rng = np.random.default_rng(9)
-    values = rng.normal(size=(10, 8))
-    values[rng.random(values.shape) < 0.3] = np.nan
-    inside = rng.random((10, 8 if wide else 1)) < 0.5
-    sums, numbers = np.full(5, 100.0), np.full(5, 10.0)  # goes on from what is there
-    accumulate_window(values, inside, 5, sums, numbers)
-    held = np.broadcast_to(inside, values.shape) & ~np.isnan(values)
-    np.testing.assert_allclose(sums, 100.0 + np.where(held, values, 0.0).sum(axis=0)[:5], ROUNDING)
-    assert numbers.tolist() == (10.0 + held.sum(axis=0)[:5]).tolist()
 
 
 def slow_sum_moments(sums, numbers, sound):

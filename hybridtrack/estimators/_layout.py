@@ -4,7 +4,6 @@ Lanes (runs) are kept in groups of WIDTH, each group's state together: with the 
 in the first-level cache from one span's first step to its last.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +11,10 @@ from numpy.typing import NDArray
 
 from hybridtrack.compiled import row_kernel
 from hybridtrack.models import JumpMarkovModel
-from hybridtrack.vectors import WIDTH, vectors
+from hybridtrack.vectors import WIDTH, aligned_zeros, vectors
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-CACHE_LINE_BYTES = 64
 
 
 class SparseMaps(NamedTuple):
@@ -118,14 +115,6 @@ def in_vectors(work):
 
 
 # ---- memory ----------------------------------------------------------------------------------
-
-
-def aligned_zeros(*shape: int) -> Array:
-    """Zeros at a cache line's beginning: vectors that straddle two lines cost a quarter more."""
-    size = math.prod(shape)
-    memory = np.zeros(size + CACHE_LINE_BYTES // 8)
-    first = -memory.ctypes.data % CACHE_LINE_BYTES // 8
-    return memory[first : first + size].reshape(shape)
 
 
 def start(model: JumpMarkovModel, lanes: int, initial_mean: Array | None = None) -> BankState:
