@@ -3,13 +3,13 @@
 import functools
 import threading
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.config import Experiment, Window
-from hybridtrack.estimators import Estimates, Running
+from hybridtrack.estimators import Estimates, Prepared, Running, estimators, prepare
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
 from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
@@ -34,7 +34,7 @@ from hybridtrack.statistics import (
 from hybridtrack.tallies import Tally
 from hybridtrack.vectors import WIDTH
 
-SPAN_STEPS = 50  # at most, between two looks at Python: their arrays stay in the cache
+SPAN_STEPS = 75  # at most, between two looks at Python, whose lock threads wait for
 DIVERGED = 1e60  # an estimate beyond this has no use, and its fourth power must stay finite
 
 RAW = "raw"
@@ -153,6 +153,14 @@ def _even_model(bank: _Same, step_s: float, covariance: bytes) -> JumpMarkovMode
     return bank.bank.discretise(np.array([step_s]), np.zeros(n_x), initial)
 
 
+@functools.lru_cache(maxsize=64)
+def _prepared_for_even_steps(
+    bank: _Same, step_s: float, covariance: bytes, estimator: str, settings: Any
+) -> Prepared:
+    """An estimator for such steps, which blocks have in common too."""
+    return prepare(estimators()[estimator], settings, _even_model(bank, step_s, covariance))
+
+
 class _Block:
     """The state of a block on its way through the spans."""
 
@@ -172,7 +180,8 @@ class _Block:
             self._lanes,
         )
         self._step_s = step_lengths(self._case.times_s)
-        self._even = bool((self._step_s == self._step_s[0]).all())
+        self._steps_are_even = bool((self._step_s == self._step_s[0]).all())
+        self._even: dict[str, Prepared] = {}
         self._running: dict[str, Running] = {}
         self._sheet = blank_sheet(SPAN_STEPS, self._lanes)
         self._tallies: dict[str, Tally] = {}
@@ -247,31 +256,37 @@ class _Block:
                 noise = self._simulation.initial_estimate_noise(len(states))
                 mean += square_root(initial.covariance) @ noise
         self._initial_covariances = covariances
-        self._even_models = {
-            chosen.label: _even_model(
+        for chosen in experiment.estimators:
+            covariance = np.ascontiguousarray(covariances[id(chosen.bank)], dtype=np.float64)
+            self._even[chosen.label] = _prepared_for_even_steps(
                 _Same(chosen.bank),
                 float(self._step_s[0]),
-                np.ascontiguousarray(covariances[id(chosen.bank)], dtype=np.float64).tobytes(),
+                covariance.tobytes(),
+                chosen.estimator.name,
+                chosen.settings,
             )
-            for chosen in experiment.estimators
-        }
         # The one that others are compared with goes first, so that its scores are at hand.
         for chosen in sorted(
             experiment.estimators, key=lambda c: c.label != experiment.compare_with
         ):
-            model = self._even_models[chosen.label]
-            self._running[chosen.label] = Running(chosen.estimator, chosen.settings, model, mean)
+            recursion = chosen.estimator.recursion(chosen.settings)
+            self._running[chosen.label] = Running(recursion, self._even[chosen.label], mean)
 
-    def _models(self, step_s: Array) -> dict[str, JumpMarkovModel]:
-        """Each estimator's model for the given steps; estimators of one bank share it."""
+    def _prepared(self, span: slice) -> dict[str, Prepared]:
+        """Each estimator for the steps of a span; estimators of one bank share its matrices."""
+        if self._steps_are_even:
+            return self._even
         nothing = np.zeros(len(self._experiment.bank.state_names))
         built: dict[int, JumpMarkovModel] = {}
         for chosen in self._experiment.estimators:
             bank = chosen.bank
             if id(bank) not in built:
                 start = self._initial_covariances[id(bank)]
-                built[id(bank)] = bank.discretise(step_s, nothing, start)
-        return {c.label: built[id(c.bank)] for c in self._experiment.estimators}
+                built[id(bank)] = bank.discretise(self._step_s[span], nothing, start)
+        return {
+            c.label: prepare(c.estimator, c.settings, built[id(c.bank)])
+            for c in self._experiment.estimators
+        }
 
     # ---- one span ----
 
@@ -279,10 +294,10 @@ class _Block:
         """Filter and score scans that none of the filters started from."""
         held = self._windows(span, scans.truth) if self._held is None else self._held[span]
         self._score(span, RAW, scans, held, as_measured(scans.measurements))
-        models = self._even_models if self._even else self._models(self._step_s[span])
+        prepared = self._prepared(span)
         covariance = self._task.tracks > 0
         for label, running in self._running.items():
-            estimates = running.advance(models[label], scans.measurements, covariance=covariance)
+            estimates = running.advance(prepared[label], scans.measurements, covariance=covariance)
             self._note_status(span, label, estimates)
             self._score(span, label, scans, held, estimates)
             self._keep_estimates(span, label, running, estimates)

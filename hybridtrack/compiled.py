@@ -85,6 +85,7 @@ numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
 # Loops over a few states, unrolled fourfold with a remainder, make the recursion's code too long
 # for the cache of instructions, and a third slower.
 llvmlite.binding.set_option("", "-unroll-runtime=false")
+COMPILED = not numba.config.DISABLE_JIT
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -98,6 +99,11 @@ def lane_kernel(function: Callable[..., Any]) -> Any:
     Every view of a row would count one up and down again: a third of the recursion's time.
     """
     return numba.njit(function, cache=True, nogil=True, fastmath=FAST, **UNCOUNTED)
+
+
+def short_kernel(function: Callable[..., Any]) -> Any:
+    """A lane kernel that keeps Python's lock: done before another thread would be awake."""
+    return numba.njit(function, cache=True, fastmath=FAST, **UNCOUNTED)
 
 
 def row_kernel(function: Callable[..., Any]) -> Any:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridtrack.compiled import lane_kernel, row_kernel
+from hybridtrack.compiled import lane_kernel, row_kernel, short_kernel
 from hybridtrack.estimators import Estimates
 from hybridtrack.models import Array
 from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES
@@ -303,7 +303,7 @@ def fill_sheet(sheet, layout, k, scans, estimates, missed):
             compare_advantages(rows[KEPT_ROW], advantage, sheet.leading[k])
 
 
-@lane_kernel
+@short_kernel
 def all_below(values, limit):
     """Whether every |value| of (n_steps, n, lanes) is below the limit, which NaN isn't."""
     beyond = 0

@@ -6,6 +6,7 @@ depends neither on how many runs were asked for nor on the length of spans.
 """
 
 import enum
+import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -163,8 +164,14 @@ def _drive(state, modes, noise, state_transition, input_effect, noise_root, out)
 
 def square_root(covariance: Array) -> Array:
     """L (..., n, n) with L L' = covariance, which may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
+    return _square_root(np.asarray(covariance, dtype=np.float64).tobytes(), covariance.shape)
+
+
+@functools.lru_cache(maxsize=256)  # every block begins with the same ones
+def _square_root(covariance: bytes, shape: tuple[int, ...]) -> Array:
+    values, vectors = np.linalg.eigh(np.frombuffer(covariance).reshape(shape))
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))[..., np.newaxis, :]
+    root.flags.writeable = False
     return root
 
 

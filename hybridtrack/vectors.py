@@ -14,7 +14,6 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -23,6 +22,8 @@ from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 from numpy.typing import NDArray
+
+from hybridtrack.compiled import COMPILED
 
 WIDTH = 32
 CACHE_LINE_BYTES = 64
@@ -360,7 +361,7 @@ def _parts(x: Any) -> tuple[Any, Any]:
     return np.where(low, 2.0 * fraction, fraction), (power - low).astype(np.float64)
 
 
-if numba.config.DISABLE_JIT:
+if not COMPILED:
     vectors = _Shown
     load = lambda row, index: row[_lanes(index)].copy()  # noqa: E731
     store = lambda row, index, value: np.copyto(row[_lanes(index)], value)  # noqa: E731

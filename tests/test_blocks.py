@@ -370,10 +370,10 @@ def test_starts_drawn_about_the_truth_have_the_stated_covariance(tmp_path):
     starts = []
 
     class Watched(blocks.Running):
-        def __init__(self, estimator, settings, model, mean):
+        def __init__(self, recursion, first, mean):
             starts.append(mean)
-            np.testing.assert_array_equal(model.initial_covariance, covariance)
-            super().__init__(estimator, settings, model, mean)
+            np.testing.assert_array_equal(first.model.initial_covariance, covariance)
+            super().__init__(recursion, first, mean)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(blocks, "Running", Watched)

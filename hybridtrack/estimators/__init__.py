@@ -7,6 +7,7 @@ and defaults; the scenario's checked form is derived from it.
 import functools
 import importlib
 import pkgutil
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from hybridtrack.estimators._bank import Recursion
 from hybridtrack.estimators._layout import Array, Estimates
 from hybridtrack.models import JumpMarkovModel
 
-__all__ = ["BankEstimator", "Estimates", "Running", "estimators"]
+__all__ = ["BankEstimator", "Estimates", "Prepared", "Running", "estimators", "prepare"]
 
 
 class BankEstimator(NamedTuple):
@@ -41,51 +42,70 @@ def estimators() -> Mapping[str, BankEstimator]:
     return dict(sorted(found.items()))
 
 
+class Prepared(NamedTuple):
+    """An estimator's model for some steps, as it is and as the kernel wants it."""
+
+    model: JumpMarkovModel
+    kernel: _layout.KernelModel
+
+
+def prepare(estimator: BankEstimator, settings: Any, model: JumpMarkovModel) -> Prepared:
+    """The estimator's own model of a bank's. Worth keeping for every block with these steps."""
+    own = estimator.model(model, settings)
+    return Prepared(own, _layout.kernel_model(own))
+
+
 class Running:
-    """One estimator at work on one block of runs; remembers its state between spans.
+    """One estimator at work on one block of runs; remembers its state between spans."""
 
-    `status` (lanes,) holds 0, or the first step at which a run's estimate was no finite number.
-    """
-
-    def __init__(
-        self,
-        estimator: BankEstimator,
-        settings: Any,
-        model: JumpMarkovModel,
-        initial_mean: Array,
-    ) -> None:
-        """model: of the first span; initial_mean (n_x, lanes)."""
-        self._estimator = estimator
-        self._settings = settings
-        self._recursion = estimator.recursion(settings)
-        self._model = estimator.model(model, settings)
-        self._kernel_model = _layout.kernel_model(self._model)
-        self._given = model
+    def __init__(self, recursion: Recursion, first: Prepared, initial_mean: Array) -> None:
+        """first: for the first span; initial_mean (n_x, lanes)."""
+        self._recursion = recursion
+        self._model = first.model
         self._lanes = initial_mean.shape[1]
-        self._state = _layout.start(self._model, self._lanes, initial_mean)
-        self._work = _layout.workspace(self._model)
-        self._room: Estimates | None = None
-        self.mode_names = _layout.output_modes(self._model)
-        self.state_names = self._model.state_names
+        self._state = _layout.start(first.model, self._lanes, initial_mean)
+        self.mode_names = _layout.output_modes(first.model)
+        self.state_names = first.model.state_names
 
     def advance(
-        self, model: JumpMarkovModel, measurements: Array, *, covariance: bool = False
+        self, prepared: Prepared, measurements: Array, *, covariance: bool = False
     ) -> Estimates:
         """Filter a span: measurements (n_steps, n_y, lanes), NaN where missed.
 
-        The estimates live in memory that the next call overwrites.
+        The estimates live in memory that the thread's next call, of any estimator, overwrites:
+        what is used at once is still in the cache.
         """
-        if model is not self._given:
-            self._given = model
-            self._kernel_model = _layout.kernel_model(self._estimator.model(model, self._settings))
-        steps = len(measurements)
-        room = self._room
-        if room is None or len(room.mean) != steps or bool(len(room.covariance)) != covariance:
-            likelihoods = len(self.mode_names) > 1
-            room = self._room = _layout.empty_estimates(
-                self._model, steps, self._lanes, likelihoods=likelihoods, covariance=covariance
-            )
-        _bank.run_span(
-            self._state, self._work, self._kernel_model, self._recursion, measurements, room
+        room = _memory.room(
+            self._model, len(measurements), self._lanes, len(self.mode_names) > 1, covariance
         )
+        work = _memory.workspace(self._model)
+        _bank.run_span(self._state, work, prepared.kernel, self._recursion, measurements, room)
         return room
+
+
+class _Memory(threading.local):
+    """What a thread's calls use one after the other, by size."""
+
+    def __init__(self) -> None:
+        self._workspaces: dict[tuple[int, ...], _layout.Workspace] = {}
+        self._rooms: dict[tuple[Any, ...], Estimates] = {}
+
+    def workspace(self, model: JumpMarkovModel) -> _layout.Workspace:
+        size = model.measurement_matrix.shape
+        if size not in self._workspaces:
+            self._workspaces[size] = _layout.workspace(model)
+        return self._workspaces[size]
+
+    def room(
+        self, model: JumpMarkovModel, steps: int, lanes: int, likelihoods: bool, covariance: bool
+    ) -> Estimates:
+        shape, outputs = model.measurement_matrix.shape, len(set(model.mode_names))
+        size = (shape, outputs, steps, lanes, likelihoods, covariance)
+        if size not in self._rooms:
+            self._rooms[size] = _layout.empty_estimates(
+                model, steps, lanes, likelihoods=likelihoods, covariance=covariance
+            )
+        return self._rooms[size]
+
+
+_memory = _Memory()

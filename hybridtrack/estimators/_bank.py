@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridtrack.compiled import lane_kernel, row_kernel
+from hybridtrack.compiled import COMPILED, lane_kernel, row_kernel
 from hybridtrack.elementary import log, maximum
 from hybridtrack.estimators._layout import (
     Array,
@@ -260,5 +260,8 @@ def run_span(
 ) -> None:
     """`advance` with its arguments' types as Python sees them."""
     arguments: tuple[Any, ...] = (state, workspace, model, recursion, measurements, known_modes)
-    with np.errstate(all="ignore"):  # uncompiled, NumPy would warn of what the kernel deals with
+    if COMPILED:
         advance(*arguments, estimates)
+    else:
+        with np.errstate(all="ignore"):  # NumPy would warn of what the kernel deals with
+            advance(*arguments, estimates)
