@@ -3,6 +3,7 @@
 Memory is the sum of the proportional set sizes of a command's processes (Linux only).
 """
 
+import multiprocessing
 import os
 import statistics
 import subprocess
@@ -29,6 +30,8 @@ LARGEST_MB = 600
 CORES_GAIN = 1.7
 END_TO_END = 2.0
 
+_FORK: Any = multiprocessing.get_context("fork")  # kernels compiled before are in both
+
 
 def measure(rounds: int) -> list[str]:
     """Every figure of a whole run, as a Markdown table."""
@@ -36,23 +39,26 @@ def measure(rounds: int) -> list[str]:
     imm = tuple(chosen for chosen in everything.estimators if chosen.label == "IMM")
     lines = [f"| {SCENARIO}, {RUNS:,} runs | measured | aim |", "| --- | --: | --: |"]
     if available_cores() >= 2:
-        gains = [_machine_gain() for _ in range(rounds)]
-        lines.append(f"| throughput, 2 cores over 1, the machine itself | {_spread(gains)} | |")
         for name, experiment in (
             ("IMM only", everything._replace(estimators=imm)),
             ("all estimators", everything),
         ):
-            figure = _spread(_gains_by_two(experiment, rounds))
-            lines.append(f"| throughput, 2 threads over 1, {name} | {figure} | {CORES_GAIN} |")
-    filters_s = _filters_cpu_s(everything)
+            threads, processes = _gains_by_two(experiment, rounds)
+            lines += [
+                f"| throughput, 2 threads over 1, {name} | {_spread(threads)} | {CORES_GAIN} |",
+                f"| 2 processes that share nothing, {name} | {_spread(processes)} | |",
+            ]
+    filters_s, blocks_s = _blocks_cpu_s(everything)
     _command(BLOCK_RUNS)  # compiles what no block needs, and warms the files
     for runs in (RUNS, 10 * RUNS):
         cpu_s, megabytes = _command(runs)
         if runs == RUNS:
             lines += [
                 f"| CPU time of the command | {cpu_s:.1f} s | |",
-                f"| CPU time of its filters | {filters_s:.1f} s | |",
-                f"| the one over the other | {cpu_s / filters_s:.2f} | {END_TO_END} |",
+                f"| CPU time of its blocks: drawn, filtered, scored | {blocks_s:.2f} s | |",
+                f"| CPU time of its filters | {filters_s:.2f} s | |",
+                f"| the command over its filters | {cpu_s / filters_s:.1f} | {END_TO_END} |",
+                f"| its blocks over its filters | {blocks_s / filters_s:.2f} | |",
             ]
         lines.append(f"| peak memory, {runs:,} runs | {megabytes:.0f} MB | {LARGEST_MB} MB |")
     return lines
@@ -60,19 +66,6 @@ def measure(rounds: int) -> list[str]:
 
 def _spread(values: list[float]) -> str:
     return f"{statistics.median(values):.2f} ({min(values):.2f}-{max(values):.2f})"
-
-
-def _machine_gain() -> float:
-    """What two processes that share nothing gain: less than 2 where others use the cores too."""
-    counting = [sys.executable, "-c", "for i in range(30_000_000): pass"]
-    spent = []
-    for number in (1, 2):
-        begin = time.perf_counter()
-        processes = [subprocess.Popen(counting) for _ in range(number)]
-        for process in processes:
-            process.wait()
-        spent.append(time.perf_counter() - begin)
-    return 2 * spent[0] / spent[1]
 
 
 def _wall_s(experiment: config.Experiment, workers: int) -> float:
@@ -84,14 +77,24 @@ def _wall_s(experiment: config.Experiment, workers: int) -> float:
     return time.perf_counter() - begin
 
 
-def _gains_by_two(experiment: config.Experiment, rounds: int) -> list[float]:
-    """Throughput of two threads over that of one, in alternating order."""
+def _gains_by_two(experiment: config.Experiment, rounds: int) -> tuple[list[float], list[float]]:
+    """Throughput of two threads, and of two processes that share nothing, over that of one.
+
+    The second is what the machine allows: less than 2 where others use its cores too.
+    """
     _wall_s(experiment._replace(runs=BLOCK_RUNS), 1)  # compiles
-    gains = []
-    for turn in range(rounds):
-        spent = {workers: _wall_s(experiment, workers) for workers in ((1, 2), (2, 1))[turn % 2]}
-        gains.append(spent[1] / spent[2])
-    return gains
+    by_threads, by_processes = [], []
+    for _ in range(rounds):
+        one = _wall_s(experiment, 1)
+        by_threads.append(one / _wall_s(experiment, 2))
+        alone = [_FORK.Process(target=_wall_s, args=(experiment, 1)) for _ in range(2)]
+        begin = time.perf_counter()
+        for process in alone:
+            process.start()
+        for process in alone:
+            process.join()
+        by_processes.append(2 * one / (time.perf_counter() - begin))
+    return by_threads, by_processes
 
 
 @contextmanager
@@ -113,11 +116,12 @@ def _timed_filters() -> Iterator[list[float]]:
         Running.advance = advance  # type: ignore[method-assign]
 
 
-def _filters_cpu_s(experiment: config.Experiment) -> float:
-    """CPU time of the filters alone, within a run of all blocks."""
+def _blocks_cpu_s(experiment: config.Experiment) -> tuple[float, float]:
+    """CPU time of the filters alone within a run of all blocks, and of all of it."""
     with _timed_filters() as spent:
+        begin = time.process_time()
         _wall_s(experiment, 1)
-    return spent[0]
+        return spent[0], time.process_time() - begin
 
 
 def _command(runs: int) -> tuple[float, float]:

@@ -60,7 +60,7 @@ def slice_times(model, steps):
     )
 
 
-def run_kernel(model, z, recursion=None, spans=None, known=None, initial_mean=None):
+def run_kernel(model, z, recursion=None, spans=None, known=None, initial_mean=None, rubbish=0.0):
     """Filter z (steps, n_y, lanes); returns Estimates (with everything) and the last state.
 
     The state has (n_groups, ..., WIDTH); lanes that fill the last group up are copies of the last.
@@ -77,6 +77,8 @@ def run_kernel(model, z, recursion=None, spans=None, known=None, initial_mean=No
         part = slice_times(model, span)
         n = len(z[span])
         out = _layout.empty_estimates(part, n, len(last), likelihoods=True, covariance=True)
+        for array in (*work, *out):
+            array.fill(rubbish)
         _bank.run_span(
             state,
             work,

@@ -144,6 +144,19 @@ def test_two_spans_give_the_bytes_of_one(n_times):
         assert a.tobytes() == b.tobytes()
 
 
+@pytest.mark.parametrize("name", FILTERS)
+def test_what_was_in_memory_before_does_not_matter(name):
+    """Workspace and room for estimates are used again by whoever comes next."""
+    rng = np.random.default_rng(22)
+    model = random_model(rng)
+    z = measurements(rng, 12, 2, 5)
+    recursion, _ = FILTERS[name]
+    clean, state = run_kernel(model, z, recursion)
+    spoilt, other = run_kernel(model, z, recursion, rubbish=np.nan)
+    for a, b in zip((*clean, *state), (*spoilt, *other), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
 @pytest.mark.parametrize("lanes", [16, 32, 48])
 def test_a_lane_does_not_depend_on_how_many_there_are(lanes):
     rng = np.random.default_rng(15)

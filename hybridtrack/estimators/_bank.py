@@ -222,7 +222,7 @@ def advance(bank_state, workspace, model, choices, measurements, known_modes, es
             for j in range(n_modes):
                 predict(j, state, work, model, time, noise_time)
                 if residuals:
-                    predict_residual(j, state, work, model, time)
+                    predict_residual(j, state, work, model, time, errors)
                 update(j, state, work, model, seen, errors)
             if residuals:
                 divide_by_residual_mean(work, seen, common, choices.residual_floor, n_modes, n_y)

@@ -7,18 +7,20 @@ from hybridtrack.vectors import repeat, select, sqrt
 
 
 @row_kernel
-def predict_residual(j, state, work, model, time):
+def predict_residual(j, state, work, model, time, errors):
     """RMIMM's mean residual of filter j (Hwang 2006, eq. 28), the true mode marginalised.
 
     rbar_j = sum_i w_i C_i (A_i y_j + b_i) - C_j (A_j x0_j + b_j) with w the predicted mode
     probabilities and y_j = x0_j + ebar0_j; the predicted mean error likewise without C, left in
-    state.residual_error[j]. Must follow `predict`.
+    state.residual_error[j]; without `errors` ebar0 is 0. Must follow `predict`.
     """
     n_modes, n_y, n_x = model.measurement_matrix.shape
     corrected, moved = work.row, work.gain
     residual, error = work.residual_mean[j], state.residual_error[j]
     for e in range(n_x):
-        corrected[e] = work.mixed_mean[j, e] + work.mixed_error[j, e]
+        corrected[e] = work.mixed_mean[j, e]
+        if errors:
+            corrected[e] = corrected[e] + work.mixed_error[j, e]
         error[e] = -state.mean[j, e]
     for m in range(n_y):
         residual[m] = -product(model.measurement_matrix[j, m], state.mean[j])
