@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.config import Experiment, Window
-from hybridtrack.estimators import Estimates, Prepared, Running, estimators, prepare
+from hybridtrack.estimators import Estimates, Prepared, Running, prepare
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
 from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
@@ -134,31 +134,32 @@ def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) ->
 
 
 class _Same(NamedTuple):
-    """A bank as a key: itself, not its like, since arrays have no hash."""
+    """A bank or an estimator as a key: itself, not its like, since arrays have no hash."""
 
-    bank: ModeBank
+    one: Any
 
     def __hash__(self) -> int:
-        return id(self.bank)
+        return id(self.one)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.bank is self.bank
+        return isinstance(other, _Same) and other.one is self.one
 
 
 @functools.lru_cache(maxsize=64)
 def _even_model(bank: _Same, step_s: float, covariance: bytes) -> JumpMarkovModel:
     """The model of steps of one length, which blocks have in common."""
-    n_x = len(bank.bank.state_names)
+    one: ModeBank = bank.one
+    n_x = len(one.state_names)
     initial = np.frombuffer(covariance).reshape(n_x, n_x)
-    return bank.bank.discretise(np.array([step_s]), np.zeros(n_x), initial)
+    return one.discretise(np.array([step_s]), np.zeros(n_x), initial)
 
 
 @functools.lru_cache(maxsize=64)
 def _prepared_for_even_steps(
-    bank: _Same, step_s: float, covariance: bytes, estimator: str, settings: Any
+    bank: _Same, step_s: float, covariance: bytes, estimator: _Same, settings: Any
 ) -> Prepared:
     """An estimator for such steps, which blocks have in common too."""
-    return prepare(estimators()[estimator], settings, _even_model(bank, step_s, covariance))
+    return prepare(estimator.one, settings, _even_model(bank, step_s, covariance))
 
 
 class _Block:
@@ -262,7 +263,7 @@ class _Block:
                 _Same(chosen.bank),
                 float(self._step_s[0]),
                 covariance.tobytes(),
-                chosen.estimator.name,
+                _Same(chosen.estimator),
                 chosen.settings,
             )
         # The one that others are compared with goes first, so that its scores are at hand.

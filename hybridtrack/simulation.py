@@ -164,13 +164,20 @@ def _drive(state, modes, noise, state_transition, input_effect, noise_root, out)
 
 def square_root(covariance: Array) -> Array:
     """L (..., n, n) with L L' = covariance, which may be singular."""
-    return _square_root(np.asarray(covariance, dtype=np.float64).tobytes(), covariance.shape)
+    if covariance.size > 256:  # of many steps, and not again in the next block's way
+        return _square_root(covariance)
+    return _known_square_root(covariance.tobytes(), covariance.shape)
 
 
-@functools.lru_cache(maxsize=256)  # every block begins with the same ones
-def _square_root(covariance: bytes, shape: tuple[int, ...]) -> Array:
-    values, vectors = np.linalg.eigh(np.frombuffer(covariance).reshape(shape))
+def _square_root(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(covariance)
     root: Array = vectors * np.sqrt(np.maximum(values, 0.0))[..., np.newaxis, :]
+    return root
+
+
+@functools.lru_cache  # every block begins with the same ones
+def _known_square_root(covariance: bytes, shape: tuple[int, ...]) -> Array:
+    root = _square_root(np.frombuffer(covariance).reshape(shape))
     root.flags.writeable = False
     return root
 

@@ -144,6 +144,20 @@ def test_two_spans_give_the_bytes_of_one(n_times):
         assert a.tobytes() == b.tobytes()
 
 
+@pytest.mark.parametrize("first", ["fed by all", "alone"])
+def test_two_spans_are_one_where_the_chain_changes_its_zeros(first):
+    rng = np.random.default_rng(23)
+    model = random_model(rng, n_modes=2, n_times=20)
+    alone = slice(10, 20) if first == "fed by all" else slice(0, 10)
+    model.transition_matrix[alone] = np.eye(2)
+    z = measurements(rng, 20, 2, 4)
+    whole, state = run_kernel(model, z)
+    parts, other = run_kernel(model, z, spans=[slice(0, 7), slice(7, 10), slice(10, 20)])
+    for a, b in zip((*whole, *state), (*parts, *other), strict=True):
+        assert a.tobytes() == b.tobytes()
+    compare_with_reference(model, z, Recursion())
+
+
 @pytest.mark.parametrize("name", FILTERS)
 def test_what_was_in_memory_before_does_not_matter(name):
     """Workspace and room for estimates are used again by whoever comes next."""
@@ -327,6 +341,25 @@ def constant_model(matrix, R=(1.0, 4.0)):
         initial_covariance=np.zeros((1, 1)),
         initial_mode_probabilities=np.array([0.5, 0.5]),
     )
+
+
+@pytest.mark.parametrize("scans", range(300, 330, 3))
+def test_modes_that_vanish_together_leave_no_hole(scans):
+    """Two pairs of modes; one pair gone to e**-700, then a scan that all but excludes the other."""
+    matrix = np.kron(np.eye(2), [[0.9, 0.1], [0.1, 0.9]])
+    model = random_model(np.random.default_rng(0), n_modes=4, n_x=1, n_y=1)._replace(
+        state_transition=np.ones((1, 4, 1, 1)),
+        input_effect=np.zeros((1, 4, 1)),
+        process_noise_covariance=np.zeros((1, 4, 1, 1)),
+        measurement_matrix=np.ones((4, 1, 1)),
+        measurement_noise_covariance=np.array([1.0, 1.0, 100.0, 100.0]).reshape(4, 1, 1),
+        transition_matrix=matrix[np.newaxis],
+        initial_mode_probabilities=np.full(4, 0.25),
+        initial_mean=np.zeros(1),
+        initial_covariance=np.zeros((1, 1)),
+    )
+    z = np.concatenate([np.zeros(scans), [45.0]])[:, np.newaxis, np.newaxis]
+    compare_with_reference(model, z, Recursion())
 
 
 def test_evidence_against_a_mode_that_nothing_else_feeds_is_not_forgotten():

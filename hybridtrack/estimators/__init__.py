@@ -99,13 +99,14 @@ class _Memory(threading.local):
     def room(
         self, model: JumpMarkovModel, steps: int, lanes: int, likelihoods: bool, covariance: bool
     ) -> Estimates:
-        shape, outputs = model.measurement_matrix.shape, len(set(model.mode_names))
-        size = (shape, outputs, steps, lanes, likelihoods, covariance)
-        if size not in self._rooms:
-            self._rooms[size] = _layout.empty_estimates(
+        outputs = len(set(model.mode_names))
+        size = (model.measurement_matrix.shape, outputs, lanes, likelihoods, covariance)
+        kept = self._rooms.get(size)
+        if kept is None or len(kept.mean) < steps:
+            kept = self._rooms[size] = _layout.empty_estimates(
                 model, steps, lanes, likelihoods=likelihoods, covariance=covariance
             )
-        return self._rooms[size]
+        return Estimates(*(array[:steps] for array in kept))
 
 
 _memory = _Memory()

@@ -8,10 +8,10 @@ section 3), each a function below:
 
 The covariances are packed lower triangles: element (a, c), a >= c, is at a (a + 1)/2 + c.
 
-A mode that only one mode leads to (any in a static bank, an absorbing mode that nothing else
-feeds) has a logarithm of its probability too, so that the evidence against it may exceed the range
-of a float without being forgotten: it can still come back from e**-2000. Modes that feed one
-another and are all below e**-708 together are forgotten.
+A mode that only one mode leads to, itself in the end (any in a static bank, one that can be left
+and not entered), has a logarithm of its probability too, so that the evidence against it may exceed
+the range of a float without being forgotten: it can still come back from e**-2000. Modes that feed
+one another and are all below e**-708 together are forgotten.
 """
 
 import math
@@ -38,6 +38,8 @@ from hybridtrack.vectors import load, repeat, select, store
 NO_INTERACTION, MIXING, INHERIT = 0, 1, 2
 LIKELIHOOD, RESIDUAL_MEAN, COMMON_RESIDUAL_MEAN = 0, 1, 2
 
+TINY, RAISED, LOG_RAISED = 1e-150, 2.0**600, 600 * math.log(2.0)
+
 
 class Recursion(NamedTuple):
     """The choices that tell one multiple-model filter from another."""
@@ -53,7 +55,7 @@ class Recursion(NamedTuple):
 
 
 @row_kernel
-def predict_mode_probabilities(state, work, transition, only_origin):
+def predict_mode_probabilities(state, work, transition, only_origin, keeps_logarithm):
     """c_j = sum_i p_ij mu_i (Hwang 2006, eq. 6; row = from)."""
     n_modes = transition.shape[0]
     for j in range(n_modes):
@@ -64,8 +66,9 @@ def predict_mode_probabilities(state, work, transition, only_origin):
         work.predicted_probability[j] = predicted
         origin = only_origin[j]
         if origin >= 0:
-            logarithm = state.log_mode_probabilities[origin]
-            if only_origin[origin] < 0:
+            if keeps_logarithm[origin]:
+                logarithm = state.log_mode_probabilities[origin]
+            else:
                 logarithm = log(state.mode_probabilities[origin])
             work.log_predicted_probability[j] = logarithm + math.log(transition[origin, j])
 
@@ -132,7 +135,7 @@ def predict(j, state, work, model, time, noise_time):
 
 
 @row_kernel
-def weigh_modes(state, work, only_origin, floor):
+def weigh_modes(state, work, only_origin, keeps_logarithm, floor):
     """mu_j proportional to Lambda_j c_j (Hwang 2006, eq. 11), with no underflow."""
     n_modes = only_origin.shape[0]
     for j in range(n_modes):
@@ -141,11 +144,17 @@ def weigh_modes(state, work, only_origin, floor):
             work.exponent[j] = work.exponent[j] + logarithm
             work.density[j] = repeat(1.0)
         else:
-            work.density[j] = work.density[j] * work.predicted_probability[j]
+            # What is tiny goes over to the exponent, lest it vanish where all the others do.
+            predicted = work.predicted_probability[j]
+            tiny = predicted < TINY
+            work.density[j] = work.density[j] * select(tiny, predicted * RAISED, predicted)
+            work.exponent[j] = work.exponent[j] - select(tiny, LOG_RAISED, 0.0)
     largest, total = normalise(state.mode_probabilities, work.density, work.exponent, n_modes)
     for j in range(n_modes):
         if only_origin[j] >= 0:
             state.log_mode_probabilities[j] = work.exponent[j] - (largest + log(total))
+        elif keeps_logarithm[j]:
+            state.log_mode_probabilities[j] = log(state.mode_probabilities[j])
     if floor > 0.0:
         total = repeat(0.0)
         for j in range(n_modes):
@@ -153,7 +162,7 @@ def weigh_modes(state, work, only_origin, floor):
             total += state.mode_probabilities[j]
         for j in range(n_modes):
             state.mode_probabilities[j] = state.mode_probabilities[j] / total
-            if only_origin[j] >= 0:
+            if keeps_logarithm[j]:
                 state.log_mode_probabilities[j] = log(state.mode_probabilities[j])
 
 
@@ -217,7 +226,10 @@ def advance(bank_state, workspace, model, choices, measurements, known_modes, es
                 # A scan with a missing component is missing as a whole.
                 seen = seen & (work.scan[m] == work.scan[m])
 
-            predict_mode_probabilities(state, work, transition, model.only_origin)
+            only_origin = model.only_origin[k if model.only_origin.shape[0] > 1 else 0]
+            keeps_logarithm = model.keeps_logarithm
+
+            predict_mode_probabilities(state, work, transition, only_origin, keeps_logarithm)
             mix(state, work, transition, interaction, errors, n_x)
             for j in range(n_modes):
                 predict(j, state, work, model, time, noise_time)
@@ -230,7 +242,8 @@ def advance(bank_state, workspace, model, choices, measurements, known_modes, es
                 normalise(work.weight, work.density, work.exponent, n_modes)
                 for j in range(n_modes):
                     store(estimates.mode_likelihoods[k, j], g, work.weight[j])
-            weigh_modes(state, work, model.only_origin, choices.mode_probability_floor)
+            floor = choices.mode_probability_floor
+            weigh_modes(state, work, only_origin, keeps_logarithm, floor)
             if interaction == INHERIT:
                 know_modes(state, load(known_modes[k], g), n_modes)
 
@@ -244,6 +257,9 @@ def advance(bank_state, workspace, model, choices, measurements, known_modes, es
                     if model.output_mode[j] == o:
                         total += state.mode_probabilities[j]
                 store(estimates.mode_probabilities[k, o], g, total)
+        for j in range(n_modes):  # for a next span, in which it may have an only origin
+            if not model.keeps_logarithm[j]:
+                state.log_mode_probabilities[j] = log(state.mode_probabilities[j])
 
 
 NO_KNOWN_MODES: Array = np.zeros((0, 0))

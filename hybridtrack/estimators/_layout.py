@@ -33,7 +33,8 @@ class KernelModel(NamedTuple):
     input_effect: Array  # (n_times or 1, n_modes, n_x)
     process_noise_covariance: Array  # (n_times or 1, n_modes, n_packed)
     transition_matrix: Array  # (n_times or 1, n_modes, n_modes)
-    only_origin: Indices  # (n_modes,) the one mode that a mode may come from; -1: several
+    only_origin: Indices  # (n_times or 1, n_modes) the one mode it may come from; -1: several
+    keeps_logarithm: NDArray[np.bool_]  # (n_modes,) whether it has an only origin at any time
     measurement_matrix: Array  # H (n_modes, n_y, n_x)
     decorrelation: Array  # L^-1 (n_modes, n_y, n_y)
     decorrelated_matrix: Array  # L^-1 H (n_modes, n_y, n_x)
@@ -48,7 +49,7 @@ class BankState(NamedTuple):
     mean: Array  # (n_groups, n_modes, n_x, WIDTH)
     covariance: Array  # (n_groups, n_modes, n_packed, WIDTH)
     mode_probabilities: Array  # (n_groups, n_modes, WIDTH)
-    log_mode_probabilities: Array  # (n_groups, n_modes, WIDTH), of modes with an only origin
+    log_mode_probabilities: Array  # (n_groups, n_modes, WIDTH)
     residual_error: Array  # (n_groups, n_modes, n_x, WIDTH), RMIMM's mean estimation error
 
 
@@ -202,6 +203,7 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
         variance[j] = diagonal**2
     decorrelated = np.einsum("jml,jle->jme", decorrelation, model.measurement_matrix)
     names = output_modes(model)
+    only_origin = _only_nonzero(np.swapaxes(model.transition_matrix, 1, 2))
     return KernelModel(
         state_map=_sparse(model.state_transition),
         covariance_map=_sparse(_covariance_map(model.state_transition)),
@@ -210,7 +212,8 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
             model.process_noise_covariance[..., lower[0], lower[1]]
         ),
         transition_matrix=np.ascontiguousarray(model.transition_matrix),
-        only_origin=_only_nonzero((model.transition_matrix != 0).any(axis=0).T),
+        only_origin=only_origin,
+        keeps_logarithm=np.asarray((only_origin >= 0).any(axis=0)),
         measurement_matrix=np.ascontiguousarray(model.measurement_matrix),
         decorrelation=decorrelation,
         decorrelated_matrix=np.ascontiguousarray(decorrelated),
