@@ -4,6 +4,7 @@ Lanes (runs) are kept in groups of WIDTH, each group's state together: with the 
 in the first-level cache from one span's first step to its last.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,22 +129,33 @@ def start(model: JumpMarkovModel, lanes: int, initial_mean: Array | None = None)
     groups = lanes // WIDTH
     if initial_mean is None:
         initial_mean = np.repeat(model.initial_mean[:, np.newaxis], lanes, axis=1)
-    packed = model.initial_covariance[np.tril_indices(n_x)]
+    packed = model.initial_covariance[_lower(n_x)]
     probabilities = model.initial_mode_probabilities[:, np.newaxis]
     with np.errstate(divide="ignore"):
         logarithms = np.log(probabilities)
+    rows = (n_x, packed.size, 1, 1, n_x)  # of each mode
+    memory = aligned_zeros(groups * n_modes * sum(rows) * WIDTH)
+    ends = np.cumsum(rows) * (groups * n_modes * WIDTH)
+    parts = np.split(memory, ends[:-1].tolist())
     state = BankState(
-        mean=aligned_zeros(groups, n_modes, n_x, WIDTH),
-        covariance=aligned_zeros(groups, n_modes, packed.size, WIDTH),
-        mode_probabilities=aligned_zeros(groups, n_modes, WIDTH),
-        log_mode_probabilities=aligned_zeros(groups, n_modes, WIDTH),
-        residual_error=aligned_zeros(groups, n_modes, n_x, WIDTH),
+        mean=parts[0].reshape(groups, n_modes, n_x, WIDTH),
+        covariance=parts[1].reshape(groups, n_modes, packed.size, WIDTH),
+        mode_probabilities=parts[2].reshape(groups, n_modes, WIDTH),
+        log_mode_probabilities=parts[3].reshape(groups, n_modes, WIDTH),
+        residual_error=parts[4].reshape(groups, n_modes, n_x, WIDTH),
     )
     state.mean[:] = initial_mean.reshape(n_x, groups, 1, WIDTH).transpose(1, 2, 0, 3)
     state.covariance[:] = packed[:, np.newaxis]
     state.mode_probabilities[:] = probabilities
     state.log_mode_probabilities[:] = logarithms
     return state
+
+
+@functools.cache
+def _lower(n: int) -> tuple[Indices, Indices]:
+    """Rows and columns of a packed lower triangle."""
+    rows, columns = np.tril_indices(n)
+    return rows, columns
 
 
 def workspace(model: JumpMarkovModel) -> Workspace:
@@ -193,7 +205,7 @@ def output_modes(model: JumpMarkovModel) -> tuple[str, ...]:
 def kernel_model(model: JumpMarkovModel) -> KernelModel:
     """Arrange a model for the kernel: covariances packed, zeros left out, R made diagonal."""
     n_modes, n_y, n_x = model.measurement_matrix.shape
-    lower = np.tril_indices(n_x)
+    lower = _lower(n_x)
     decorrelation = np.empty((n_modes, n_y, n_y))
     variance = np.empty((n_modes, n_y))
     for j, covariance in enumerate(model.measurement_noise_covariance):
@@ -225,8 +237,8 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
 
 def _covariance_map(F: Array) -> Array:
     """The matrix (..., n_packed, n_packed) of P -> F P F' on packed lower triangles."""
-    a, c = (index[:, np.newaxis] for index in np.tril_indices(F.shape[-1]))
-    e, g = np.tril_indices(F.shape[-1])
+    a, c = (index[:, np.newaxis] for index in _lower(F.shape[-1]))
+    e, g = _lower(F.shape[-1])
     transposed = np.where(e != g, F[..., a, g] * F[..., c, e], 0.0)
     matrix: Array = F[..., a, e] * F[..., c, g] + transposed
     return matrix
