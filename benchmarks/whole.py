@@ -29,24 +29,21 @@ SAMPLE_S = 0.05
 LARGEST_MB = 600
 CORES_GAIN = 1.7
 END_TO_END = 2.0
-
-_FORK: Any = multiprocessing.get_context("fork")  # kernels compiled before are in both
+GAIN_ROUNDS = 20  # half a second each: many, since others use the machine too
 
 
 def measure(rounds: int) -> list[str]:
     """Every figure of a whole run, as a Markdown table."""
     everything = config.load(SCENARIO, [f"monte_carlo.runs={RUNS}"])
-    imm = tuple(chosen for chosen in everything.estimators if chosen.label == "IMM")
     lines = [f"| {SCENARIO}, {RUNS:,} runs | measured | aim |", "| --- | --: | --: |"]
     if available_cores() >= 2:
-        for name, experiment in (
-            ("IMM only", everything._replace(estimators=imm)),
-            ("all estimators", everything),
-        ):
-            threads, processes = _gains_by_two(experiment, rounds)
+        for name, labels in (("IMM only", ("IMM",)), ("all estimators", None)):
+            number = max(rounds, GAIN_ROUNDS)
+            threads = _spread(_gain_by_threads(labels, number))
+            processes = _spread(_gain_by_processes(labels, number))
             lines += [
-                f"| throughput, 2 threads over 1, {name} | {_spread(threads)} | {CORES_GAIN} |",
-                f"| 2 processes that share nothing, {name} | {_spread(processes)} | |",
+                f"| throughput, 2 threads over 1, {name} | {threads} | {CORES_GAIN} |",
+                f"| 2 processes that share nothing, {name} | {processes} | |",
             ]
     filters_s, blocks_s = _blocks_cpu_s(everything)
     _command(BLOCK_RUNS)  # compiles what no block needs, and warms the files
@@ -77,24 +74,54 @@ def _wall_s(experiment: config.Experiment, workers: int) -> float:
     return time.perf_counter() - begin
 
 
-def _gains_by_two(experiment: config.Experiment, rounds: int) -> tuple[list[float], list[float]]:
-    """Throughput of two threads, and of two processes that share nothing, over that of one.
+Labels = tuple[str, ...] | None  # estimators, None for all
 
-    The second is what the machine allows: less than 2 where others use its cores too.
-    """
+
+def _experiment(labels: Labels) -> config.Experiment:
+    experiment = config.load(SCENARIO, [f"monte_carlo.runs={RUNS}"])
+    chosen = tuple(c for c in experiment.estimators if labels is None or c.label in labels)
+    return experiment._replace(estimators=chosen)
+
+
+def _gain_by_threads(labels: Labels, rounds: int) -> list[float]:
+    """Throughput of two threads over that of one, round by round."""
+    experiment = _experiment(labels)
     _wall_s(experiment._replace(runs=BLOCK_RUNS), 1)  # compiles
-    by_threads, by_processes = [], []
+    return [_wall_s(experiment, 1) / _wall_s(experiment, 2) for _ in range(rounds)]
+
+
+def _gain_by_processes(labels: Labels, rounds: int) -> list[float]:
+    """The same of two processes that share nothing: what the machine allows.
+
+    Less than 2 where others use its cores too.
+    """
+    experiment = _experiment(labels)
+    context = multiprocessing.get_context("spawn")
+    barrier, times = context.Barrier(3), context.Queue()
+    alone = [
+        context.Process(target=_alone, args=(labels, rounds, barrier, times)) for _ in range(2)
+    ]
+    for process in alone:
+        process.start()
+    gains = []
     for _ in range(rounds):
+        barrier.wait()  # both are ready, and rest
         one = _wall_s(experiment, 1)
-        by_threads.append(one / _wall_s(experiment, 2))
-        alone = [_FORK.Process(target=_wall_s, args=(experiment, 1)) for _ in range(2)]
-        begin = time.perf_counter()
-        for process in alone:
-            process.start()
-        for process in alone:
-            process.join()
-        by_processes.append(2 * one / (time.perf_counter() - begin))
-    return by_threads, by_processes
+        barrier.wait()  # they work
+        gains.append(2 * one / max(times.get(), times.get()))
+    for process in alone:
+        process.join()
+    return gains
+
+
+def _alone(labels: Labels, rounds: int, barrier: Any, times: Any) -> None:
+    """One of two processes that each do all blocks in one thread, at the same time."""
+    experiment = _experiment(labels)
+    _wall_s(experiment._replace(runs=BLOCK_RUNS), 1)
+    for _ in range(rounds):
+        barrier.wait()
+        barrier.wait()
+        times.put(_wall_s(experiment, 1))
 
 
 @contextmanager
