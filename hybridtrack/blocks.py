@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.config import Experiment, Window
-from hybridtrack.estimators import Estimates, Prepared, Running, prepare
+from hybridtrack.estimators import NO_KNOWN_MODES, Estimates, Prepared, Running, prepare
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
 from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
@@ -184,6 +184,8 @@ class _Block:
         self._steps_are_even = bool((self._step_s == self._step_s[0]).all())
         self._even: dict[str, Prepared] = {}
         self._running: dict[str, Running] = {}
+        chosen = experiment.estimators
+        self._told = {c.label for c in chosen if c.estimator.is_told_modes(c.settings)}
         self._sheet = blank_sheet(SPAN_STEPS, self._lanes)
         self._tallies: dict[str, Tally] = {}
         self._shares = {
@@ -298,10 +300,20 @@ class _Block:
         prepared = self._prepared(span)
         covariance = self._task.tracks > 0
         for label, running in self._running.items():
-            estimates = running.advance(prepared[label], scans.measurements, covariance=covariance)
+            told = self._true_modes(running, scans) if label in self._told else NO_KNOWN_MODES
+            estimates = running.advance(
+                prepared[label], scans.measurements, covariance=covariance, known_modes=told
+            )
             self._note_status(span, label, estimates)
             self._score(span, label, scans, held, estimates)
             self._keep_estimates(span, label, running, estimates)
+
+    def _true_modes(self, running: Running, scans: Scans) -> Array:
+        """The truth's modes as the estimator counts them (n_steps, lanes)."""
+        number = [running.mode_names.index(name) for name in self._experiment.truth_modes]
+        shape = (len(scans.measurements), self._lanes)
+        modes = np.array(number, dtype=np.float64)[scans.truth.mode]
+        return np.ascontiguousarray(np.broadcast_to(modes, shape))
 
     def _score(
         self,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridtrack.chains import Bound, Supermodes
 from hybridtrack.compiled import kernel
 from hybridtrack.errors import UserError
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
@@ -109,6 +110,7 @@ class ChainTruth(NamedTuple):
     bank: ModeBank
     initial_mean: Array  # (n_x,)
     initial_covariance: Array  # (n_x, n_x); 0 for a fixed start
+    bound: Bound = Bound()  # on how often the mode changes
 
 
 Truth = FixedTruth | ChainTruth
@@ -257,11 +259,12 @@ class BlockSimulation:
                 square_root(truth.initial_covariance) @ draws
             )
             uniform = self._stream(Purpose.MODE_SEQUENCE).random(BLOCK_RUNS)
-            cumulative = np.cumsum(truth.bank.initial_mode_probabilities)[:-1]
-            self._mode: Modes = np.searchsorted(cumulative, uniform, side="right")
+            self._step_s = step_lengths(case.times_s)
+            chain = _chain(truth, truth_model(truth, self._step_s[:1]))
+            cumulative = np.cumsum(chain.initial_probabilities)[:-1]
+            self._supermode: Modes = np.searchsorted(cumulative, uniform, side="right")
             self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
             self.initial_state = self._state[:, :lanes].copy()
-            self._step_s = step_lengths(case.times_s)
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
@@ -334,9 +337,12 @@ class BlockSimulation:
         model = truth_model(truth, self._step_s[span])
         steps, n_x = span.stop - span.start, len(self.state_names)
         uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
-        modes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
-        before = self._mode.copy()
-        _draw_modes(self._mode, uniform, np.cumsum(model.transition_matrix, axis=-1), modes)
+        chain = _chain(truth, model)
+        supermodes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
+        before = chain.mode[self._supermode]
+        cumulative = np.cumsum(chain.transition_matrix, axis=-1)
+        _draw_modes(self._supermode, uniform, cumulative, supermodes)
+        modes = chain.mode[supermodes]
         noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, n_x, BLOCK_RUNS))
         state = np.empty((steps, n_x, BLOCK_RUNS))
         root = np.ascontiguousarray(square_root(model.process_noise_covariance))
@@ -366,6 +372,10 @@ def _since_switch(times_s: Array, modes: Modes) -> Array:
 def truth_model(truth: ChainTruth, step_s: Array) -> JumpMarkovModel:
     """The truth's own jump Markov model for the given steps."""
     return truth.bank.discretise(step_s, truth.initial_mean, truth.initial_covariance)
+
+
+def _chain(truth: ChainTruth, model: JumpMarkovModel) -> Supermodes:
+    return truth.bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
 
 
 def two_point_start(

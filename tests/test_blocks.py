@@ -66,7 +66,7 @@ def slow_start(experiment, case, z, truth_start, run, bank=None):
     return mean + square_root(initial.covariance) @ draw, initial.covariance, 0
 
 
-def slow_filter(experiment, label, model, z, mean):
+def slow_filter(experiment, label, model, z, mean, true_modes):
     """The reference's history for one estimator of the scenario."""
     chosen = next(c for c in experiment.estimators if c.label == label)
     estimator, settings, options = chosen.estimator, chosen.settings, {}
@@ -74,6 +74,8 @@ def slow_filter(experiment, label, model, z, mean):
         model = model.only(settings.mode)
     if estimator.name == "mmae":
         options = {"mixing": False}
+    if estimator.name == "genie":
+        options = {"known": true_modes}
     if estimator.name == "rmimm":
         floor, recursive = settings.residual_floor_m, settings.residual_error == "recursive"
         options = {"rmimm": {"floor": floor, "recursive": recursive, "common": False}}
@@ -135,7 +137,7 @@ def simulated(experiment, runs):
     simulation = BlockSimulation(case, experiment.sensor, experiment.seed, 0, 0, runs)
     names = simulation.state_names
     start = simulation.initial_state
-    first_mode = getattr(simulation, "_mode", np.full(runs, -1)).copy()
+    first_mode = getattr(simulation, "_supermode", np.full(runs, -1)).copy()
     truth, z = simulation.advance(slice(0, len(case.times_s) - 1))
     starts = [
         {n: start[e, b if start.shape[1] > 1 else 0] for e, n in enumerate(names)}
@@ -171,7 +173,8 @@ def slow_block(experiment, runs):
         for chosen in experiment.estimators:
             _, own, _ = slow_start(experiment, case, z, starts[b], b, chosen.bank)
             own_model = model._replace(initial_covariance=own)
-            history = slow_filter(experiment, chosen.label, own_model, z[used:], mean)
+            known = modes[b][used + 1 :]
+            history = slow_filter(experiment, chosen.label, own_model, z[used:], mean, known)
             estimates[chosen.label, b] = history
             for k, estimate in enumerate(history, start=used):
                 scores, advantages[chosen.label, k] = slow_scores(
@@ -197,7 +200,14 @@ def slow_block(experiment, runs):
     return values, held, estimates
 
 
-SCENARIOS = {"legs, even steps": SMALL, "chain, uneven steps, two-point start": RANDOM}
+def with_genie(text):
+    return text.replace("compare_with:", "  genie: {type: genie}\ncompare_with:")
+
+
+SCENARIOS = {
+    "legs, even steps": with_genie(SMALL),
+    "chain, uneven steps, two-point start": with_genie(RANDOM),
+}
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -401,13 +411,13 @@ class Planted(blocks.Running):
 
     seen = 0
 
-    def advance(self, model, measurements, *, covariance=False):
+    def advance(self, prepared, measurements, **options):
         begin, self.seen = self.seen, self.seen + len(measurements)
         for run, step, value in ((2, 35, np.inf), (4, 20, 1e200)):
             if begin < step <= self.seen:
                 measurements = measurements.copy()
                 measurements[step - begin - 1, 0, run] = value
-        return super().advance(model, measurements, covariance=covariance)
+        return super().advance(prepared, measurements, **options)
 
 
 def test_a_run_that_diverges_is_noted_and_harms_no_other(tmp_path, monkeypatch):

@@ -47,7 +47,7 @@ FLOOR = "RMIMM: {type: rmimm, residual_floor_m: 1.0}"
 WINDOW = "straight_settled: {mode: CV, after_switch_s: 10}"
 COMPARE = "compare: [RMIMM, IMM]\n    metric: mode_accuracy\n    sign: greater"
 RUNS = "monte_carlo: {runs: 1000, seed: 5}"
-TYPES = "there are imm, kalman, mmae, rmimm"
+TYPES = "there are genie, hbf, imm, kalman, mmae, rmimm, sbf"
 MOTIONS = (
     "constant_velocity, constant_velocity_with_input, constant_velocity_zero_acceleration, "
     "coordinated_turn, wiener_acceleration"
@@ -196,11 +196,20 @@ KINDS: list[tuple[Edit, str]] = [
     ((MMAE, "MMAE: {»type: banana}"), f"'type' is banana, which is not known; {TYPES}"),
     ((MMAE, "MMAE: {»type: 3}"), f"'type' is 3, which is not known; {TYPES}"),
     ((MMAE, "MMAE: {»type: [mmae]}"), f"'type' is a list, which is not known; {TYPES}"),
-    ((MMAE, "MMAE: {»type: }"), "'type' is missing in 'MMAE'; add one of imm, kalman, mmae, rmimm"),
-    ((MMAE, "»MMAE: {}"), "'type' is missing in 'MMAE'; add one of imm, kalman, mmae, rmimm"),
-    ((MMAE, "»MMAE:"), "'type' is missing in 'MMAE'; add one of imm, kalman, mmae, rmimm"),
-    ((MMAE, "»MMAE: mmae"), "'MMAE' is mmae; it must be a mapping, such as {type: imm}"),
-    ((MMAE, "»MMAE: [mmae]"), "'MMAE' is a list; it must be a mapping, such as {type: imm}"),
+    (
+        (MMAE, "MMAE: {»type: }"),
+        "'type' is missing in 'MMAE'; add one of genie, hbf, imm, kalman, mmae, rmimm, sbf",
+    ),
+    (
+        (MMAE, "»MMAE: {}"),
+        "'type' is missing in 'MMAE'; add one of genie, hbf, imm, kalman, mmae, rmimm, sbf",
+    ),
+    (
+        (MMAE, "»MMAE:"),
+        "'type' is missing in 'MMAE'; add one of genie, hbf, imm, kalman, mmae, rmimm, sbf",
+    ),
+    ((MMAE, "»MMAE: mmae"), "'MMAE' is mmae; it must be a mapping, such as {type: genie}"),
+    ((MMAE, "»MMAE: [mmae]"), "'MMAE' is a list; it must be a mapping, such as {type: genie}"),
     ((CT, "CT: {»motion: weiner_acceleration}"), "is weiner_acceleration, which is not known; did"),
     ((CT, "CT: {»motion: banana}"), f"'motion' is banana, which is not known; there are {MOTIONS}"),
     ((CT, "CT: {»motion: matrices}"), f"is matrices, which is not known; there are {MOTIONS}"),
@@ -512,7 +521,55 @@ MATRICES: list[tuple[list[Edit], str]] = [
         [(CHAIN_START, f"initial: {{mean: [0, 1]}}\n    {OWN_MODES}")],
         "'position_std_m' has no place in the truth's modes, since the sensor measures; remove it",
     ),
+    (
+        [
+            (
+                CHAIN_START,
+                f"{CHAIN_START}\n    continuation_probability: 0.9\n    »most_transitions: 2",
+            )
+        ],
+        "'most_transitions' bounds a chain hard and 'continuation_probability' softly; remove one",
+    ),
+    (
+        [(CHAIN_START, f"{CHAIN_START}\n    »continuation_probability: 1.5")],
+        "'continuation_probability' is 1.5; it must be at most 1",
+    ),
+    (
+        [(CHAIN_START, f"{CHAIN_START}\n    »most_transitions: -1")],
+        "'most_transitions' is -1; it must be at least 0",
+    ),
+    (
+        [
+            (
+                CHAIN_START,
+                f"{CHAIN_START}\n    {OWN_MODES.replace(', »position_std_m: 3', '')}\n"
+                "    transition_matrix: [[1]]",
+            ),
+            ("mode_probabilities: [0.2, 0.8]", "mode_probabilities: [1]"),
+            ("IMM: {type: imm}", "IMM: {»type: genie}"),
+        ],
+        "'IMM' is told the true modes, and has no 'A' among its own (slow, fast); remove it",
+    ),
+    (
+        [("IMM: {type: imm}", "»IMM: {type: sbf}")],
+        "'continuation_probability' is missing in 'IMM'; add it",
+    ),
 ]
+
+
+def test_the_genie_needs_modes_that_a_recording_does_not_have(tmp_path: Path) -> None:
+    """Without a file to read: the times of the track stand beside it."""
+    (tmp_path / "track.csv").write_text(
+        "time,x,y\n" + "".join(f"{k},{10 * k},{5 * k}\n" for k in range(40))
+    )
+    text = FIG5.read_text()
+    begin, end = text.index("truth:"), text.index("sensor:")
+    text = text[:begin] + "truth: {recording: {file: track.csv}}\n\n" + text[end:]
+    text = text[: text.index("windows:")] + "monte_carlo: {runs: 2, seed: 1}\n"
+    text = text.replace(f"{CLOCK}\n", "").replace(MATRIX, "mean_sojourn_s: {CV: 20, CT: 20}")
+    loaded(text, tmp_path)
+    message = complaint(text.replace("IMM: {type: imm}", "IMM: {type: genie}"), tmp_path / "s.yaml")
+    assert "'IMM' is told the true modes, and a recording has none; remove it" in message
 
 
 def placed(text: str, edits: list[Edit]) -> tuple[str, str]:

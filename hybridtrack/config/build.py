@@ -30,7 +30,9 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         )
     _check_recorded(form, cases, initial, document)
     banks.try_out(bank, steps, document, ())
-    chosen = tuple(_estimator(label, form, bank, steps, document) for label in form.estimators)
+    chosen = tuple(
+        _estimator(label, form, bank, truth_modes, steps, document) for label in form.estimators
+    )
     if form.compare_with is not None and form.compare_with not in form.estimators:
         raise document.error(
             ("compare_with",),
@@ -94,8 +96,31 @@ def _check_recorded(
 TAKEN_LABELS = ("raw", "truth", "measurement", "measurements")
 
 
+def _check_modes_can_be_told(
+    label: str, truth_modes: tuple[str, ...], bank: ModeBank, document: Document
+) -> None:
+    """The genie needs a truth with modes, all of them its own."""
+    path: Keys = ("estimators", label, "type")
+    if not truth_modes:
+        raise document.error(
+            path, f"'{label}' is told the true modes, and a recording has none; remove it"
+        )
+    unknown = [name for name in truth_modes if name not in bank.names]
+    if unknown:
+        raise document.error(
+            path,
+            f"'{label}' is told the true modes, and has no '{unknown[0]}' among its own "
+            f"({', '.join(bank.names)}); remove it, or call the modes alike",
+        )
+
+
 def _estimator(
-    label: str, form: ScenarioForm, bank: ModeBank, steps_s: Sequence[Array], document: Document
+    label: str,
+    form: ScenarioForm,
+    bank: ModeBank,
+    truth_modes: tuple[str, ...],
+    steps_s: Sequence[Array],
+    document: Document,
 ) -> ChosenEstimator:
     if label in TAKEN_LABELS:
         raise document.error(
@@ -114,6 +139,8 @@ def _estimator(
         checks.known_mode(values["mode"], tuple(form.modes), document, path)
         bank = banks.single_mode_bank(values["mode"], form, document)
     settings = estimator.settings(**values)
+    if estimator.is_told_modes(settings):
+        _check_modes_can_be_told(label, truth_modes, bank, document)
     try:
         estimator.model(banks.try_out(bank, steps_s, document, ()), settings)
     except ScenarioError:

@@ -172,13 +172,19 @@ else:
 
 
 class ChainForm(Form):
-    """Truth simulated from a jump Markov model: the scenario's modes unless it has its own."""
+    """Truth simulated from a jump Markov model: the scenario's modes unless it has its own.
+
+    With `continuation_probability` a transition may be the last (soft bound), with
+    `most_transitions` there are no more than so many (hard bound).
+    """
 
     initial: InitialForm
     modes: dict[Name, ModeUnion] | None = None
     transition_matrix: Matrix | None = None
     mean_sojourn_s: dict[str, Positive] | None = None
     generator_per_s: Matrix | None = None
+    continuation_probability: Probability | None = None
+    most_transitions: Annotated[int, Field(ge=0, le=100)] | None = None
 
 
 class ColumnsForm(Form):

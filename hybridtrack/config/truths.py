@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridtrack.chains import Bound
 from hybridtrack.config import banks, checks, starts
 from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import FileForm, RecordingForm, ScenarioForm, TruthForm
@@ -70,7 +71,20 @@ def cases(
             f"the truth has no state '{min(unknown)}' that could be measured; name its positions "
             "x (and y) in 'states'",
         )
-    chain = ChainTruth(truth_bank, start.mean, start.covariance)
+    if (
+        truth.chain.continuation_probability is not None
+        and truth.chain.most_transitions is not None
+    ):
+        raise document.error(
+            (*path, "most_transitions"),
+            "'most_transitions' bounds a chain hard and 'continuation_probability' softly; remove "
+            "one of them",
+        )
+    bound = Bound(
+        continuation_probability=truth.chain.continuation_probability,
+        most_transitions=truth.chain.most_transitions,
+    )
+    chain = ChainTruth(truth_bank, start.mean, start.covariance, bound)
     return truth_bank.names, (Case(form.name, times_s, chain),)
 
 

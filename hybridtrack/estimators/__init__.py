@@ -12,11 +12,19 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from hybridtrack.estimators import _bank, _layout
-from hybridtrack.estimators._bank import Recursion
+from hybridtrack.estimators._bank import NO_KNOWN_MODES, Recursion
 from hybridtrack.estimators._layout import Array, Estimates
 from hybridtrack.models import JumpMarkovModel
 
-__all__ = ["BankEstimator", "Estimates", "Prepared", "Running", "estimators", "prepare"]
+__all__ = [
+    "NO_KNOWN_MODES",
+    "BankEstimator",
+    "Estimates",
+    "Prepared",
+    "Running",
+    "estimators",
+    "prepare",
+]
 
 
 class BankEstimator(NamedTuple):
@@ -29,6 +37,10 @@ class BankEstimator(NamedTuple):
     model: Callable[[JumpMarkovModel, Any], JumpMarkovModel]
     recursion: Callable[[Any], Recursion]
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
+
+    def is_told_modes(self, settings: Any) -> bool:
+        """Whether it has to be given the true modes."""
+        return self.recursion(settings).interaction == _bank.INHERIT
 
 
 @functools.cache
@@ -68,9 +80,16 @@ class Running:
         self.state_names = first.model.state_names
 
     def advance(
-        self, prepared: Prepared, measurements: Array, *, covariance: bool = False
+        self,
+        prepared: Prepared,
+        measurements: Array,
+        *,
+        covariance: bool = False,
+        known_modes: Array = NO_KNOWN_MODES,
     ) -> Estimates:
         """Filter a span: measurements (n_steps, n_y, lanes), NaN where missed.
+
+        known_modes (n_steps, lanes): the index of the true mode, where it is to be told.
 
         The estimates live in memory that the thread's next call, of any estimator, overwrites:
         what is used at once is still in the cache.
@@ -79,7 +98,9 @@ class Running:
             self._model, len(measurements), self._lanes, len(self.mode_names) > 1, covariance
         )
         work = _memory.workspace(self._model)
-        _bank.run_span(self._state, work, prepared.kernel, self._recursion, measurements, room)
+        _bank.run_span(
+            self._state, work, prepared.kernel, self._recursion, measurements, room, known_modes
+        )
         return room
 
 

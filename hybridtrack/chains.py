@@ -1,0 +1,128 @@
+"""A model on a larger chain: a bound, soft or hard, on how often the mode may change.
+
+A supermode is a mode and a stage: whether the last transition is over (soft bound), how many
+transitions there have been (hard bound). Row = from, and the supermode at k drives the step from
+k - 1 to k. Both chains stand here because truths and filters move on them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridtrack.models import Array, JumpMarkovModel
+
+Indices = NDArray[np.int64]
+
+
+class Supermodes(NamedTuple):
+    """A chain of modes and stages."""
+
+    mode: Indices  # (n_supermodes,) each one's mode
+    stage: Indices  # (n_supermodes,) 1 where ended; how many transitions there have been
+    transition_matrix: Array  # (n_times, n_supermodes, n_supermodes)
+    initial_probabilities: Array  # (n_supermodes,)
+
+
+class Bound(NamedTuple):
+    """How a chain of modes is bounded, if at all: softly or hard."""
+
+    continuation_probability: float | None = None
+    leak: float = 0.0
+    most_transitions: int | None = None
+
+    def supermodes(self, transition_matrix: Array, initial_probabilities: Array) -> Supermodes:
+        """The chain (n_times, n, n) and its start (n,) under this bound, pruned."""
+        given = (transition_matrix, initial_probabilities)
+        if self.continuation_probability is not None:
+            return pruned(soft_bound(*given, self.continuation_probability, self.leak))
+        if self.most_transitions is not None:
+            return pruned(hard_bound(*given, self.most_transitions))
+        modes = np.arange(len(initial_probabilities))
+        return Supermodes(modes, np.zeros_like(modes), *given)
+
+
+def soft_bound(
+    transition_matrix: Array,
+    initial_probabilities: Array,
+    continuation_probability: float,
+    leak: float = 0.0,
+) -> Supermodes:
+    """Modes that change by a Markov chain until a transition that ends it (Sigalov 2011, eq. 12).
+
+    transition_matrix P (n_times, n, n); initial_probabilities (n,), not ended. With p0 the
+    continuation_probability, (i, 0) -> (j, 0) has p0 p_ij, (i, 0) -> (i, 1) has 1 - p0; (i, 1)
+    stays, but for a probability `leak` of going back to (i, 0), which is ours: without it no
+    evidence frees a filter from a wrong mode that has ended.
+    """
+    n_times, n, _ = transition_matrix.shape
+    same = np.eye(n)
+    chain = np.zeros((n_times, 2 * n, 2 * n))
+    chain[:, :n, :n] = continuation_probability * transition_matrix
+    chain[:, :n, n:] = (1.0 - continuation_probability) * same
+    chain[:, n:, :n] = leak * same
+    chain[:, n:, n:] = (1.0 - leak) * same
+    return Supermodes(
+        mode=np.tile(np.arange(n), 2),
+        stage=np.repeat([0, 1], n),
+        transition_matrix=chain,
+        initial_probabilities=np.concatenate([initial_probabilities, np.zeros(n)]),
+    )
+
+
+def hard_bound(
+    transition_matrix: Array, initial_probabilities: Array, most_transitions: int
+) -> Supermodes:
+    """Modes that change by a Markov chain, at most so many times, then never again.
+
+    transition_matrix P (n_times, n, n); initial_probabilities (n,), nothing counted. (i, c) ->
+    (i, c) has p_ii and (i, c) -> (j, c + 1) has p_ij while c < most_transitions; then it stays.
+    """
+    n_times, n, _ = transition_matrix.shape
+    stages = most_transitions + 1
+    chain = np.zeros((n_times, stages, n, stages, n))
+    same = np.arange(n)
+    others = transition_matrix.copy()
+    others[:, same, same] = 0.0
+    for count in range(most_transitions):
+        chain[:, count, same, count, same] = transition_matrix[:, same, same]
+        chain[:, count, :, count + 1, :] = others
+    chain[:, -1, same, -1, same] = 1.0
+    start = np.zeros((stages, n))
+    start[0] = initial_probabilities
+    return Supermodes(
+        mode=np.tile(same, stages),
+        stage=np.repeat(np.arange(stages), n),
+        transition_matrix=chain.reshape(n_times, stages * n, stages * n),
+        initial_probabilities=start.ravel(),
+    )
+
+
+def pruned(supermodes: Supermodes) -> Supermodes:
+    """Without the supermodes that cannot be reached from the start."""
+    leads = (supermodes.transition_matrix != 0.0).any(axis=0)
+    reached = supermodes.initial_probabilities != 0.0
+    for _ in range(reached.size):
+        reached = reached | leads[reached].any(axis=0)
+    kept = np.flatnonzero(reached)
+    return Supermodes(
+        mode=supermodes.mode[kept],
+        stage=supermodes.stage[kept],
+        transition_matrix=supermodes.transition_matrix[:, kept[:, np.newaxis], kept],
+        initial_probabilities=supermodes.initial_probabilities[kept],
+    )
+
+
+def on_supermodes(model: JumpMarkovModel, supermodes: Supermodes) -> JumpMarkovModel:
+    """The model with its modes repeated on the larger chain, under their own names."""
+    mode = supermodes.mode
+    return model._replace(
+        state_transition=model.state_transition[:, mode],
+        input_effect=model.input_effect[:, mode],
+        process_noise_covariance=model.process_noise_covariance[:, mode],
+        measurement_matrix=model.measurement_matrix[mode],
+        measurement_noise_covariance=model.measurement_noise_covariance[mode],
+        transition_matrix=supermodes.transition_matrix,
+        initial_mode_probabilities=supermodes.initial_probabilities,
+        mode_names=tuple(model.mode_names[j] for j in mode),
+    )

@@ -1,0 +1,41 @@
+"""Hard bound filter: an IMM that counts the transitions and allows no more than a given number.
+
+Sigalov 2011 compares with a filter of an earlier paper (his reference 15) and says of it that its
+number of Kalman filters is linear in the number of manoeuvres, that they interact before each
+cycle, and that the start is known. This filter is so; that it equals the earlier one is unproven.
+"""
+
+from typing import NamedTuple
+
+from hybridtrack.chains import Bound, on_supermodes
+from hybridtrack.estimators import BankEstimator
+from hybridtrack.estimators._bank import MIXING, Recursion
+from hybridtrack.models import JumpMarkovModel
+
+
+class Settings(NamedTuple):
+    """most_transitions: how often the mode changes at most (r_max)."""
+
+    most_transitions: int
+
+
+def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
+    bound = Bound(most_transitions=settings.most_transitions)
+    return on_supermodes(
+        model, bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
+    )
+
+
+def _recursion(settings: Settings) -> Recursion:
+    return Recursion(interaction=MIXING)
+
+
+ESTIMATOR = BankEstimator(
+    name="hbf",
+    summary="hard bound filter: an IMM over modes and the number of transitions so far",
+    source="as described by Sigalov 2011, sections I and III-C",
+    settings=Settings,
+    model=_model,
+    recursion=_recursion,
+    limits={"most_transitions": (0.0, 100.0)},
+)

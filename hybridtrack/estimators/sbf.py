@@ -1,0 +1,42 @@
+"""Soft bound filter: an IMM that knows that the target will stop manoeuvring, but not when."""
+
+from typing import NamedTuple
+
+from hybridtrack.chains import Bound, on_supermodes
+from hybridtrack.estimators import BankEstimator
+from hybridtrack.estimators._bank import MIXING, Recursion
+from hybridtrack.models import JumpMarkovModel
+
+
+class Settings(NamedTuple):
+    """What is believed of the last transition.
+
+    continuation_probability: p0, that the step just made was not the last that may change the
+    mode; leak: that a mode which has ended comes back to life. Without a leak the filter locks in:
+    one outlier may make a wrong mode the last for ever.
+    """
+
+    continuation_probability: float
+    leak: float = 0.0
+
+
+def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
+    bound = Bound(continuation_probability=settings.continuation_probability, leak=settings.leak)
+    return on_supermodes(
+        model, bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
+    )
+
+
+def _recursion(settings: Settings) -> Recursion:
+    return Recursion(interaction=MIXING)
+
+
+ESTIMATOR = BankEstimator(
+    name="sbf",
+    summary="soft bound filter: an IMM over modes that may have ended",
+    source="Sigalov 2011, section III",
+    settings=Settings,
+    model=_model,
+    recursion=_recursion,
+    limits={"continuation_probability": (0.0, 1.0), "leak": (0.0, 1.0)},
+)

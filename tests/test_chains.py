@@ -1,0 +1,208 @@
+"""Bounds on the number of transitions: the chains against their stories told step by step, and
+the filters on them against the filters that they become at their ends."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import reference
+from hybridtrack.chains import Bound, hard_bound, on_supermodes, pruned, soft_bound
+from hybridtrack.estimators import estimators
+from hybridtrack.models import Mode, ModeBank
+from hybridtrack.simulation import BLOCK_RUNS, BlockSimulation, Case, ChainTruth, Sensor
+from models import figure_5_model, random_model, run_kernel
+
+MATRIX = np.array([[[0.7, 0.2, 0.1], [0.3, 0.6, 0.1], [0.05, 0.15, 0.8]]])
+START = np.array([0.5, 0.3, 0.2])
+
+
+def sequence_probabilities(chain, steps):
+    """By sequence of modes from k = 0 on, its probability; stages summed."""
+    found = {}
+    n = len(chain.mode)
+    for path in itertools.product(range(n), repeat=steps + 1):
+        probability = chain.initial_probabilities[path[0]]
+        for a, b in itertools.pairwise(path):
+            probability *= chain.transition_matrix[0, a, b]
+        modes = tuple(int(chain.mode[s]) for s in path)
+        found[modes] = found.get(modes, 0.0) + probability
+    return found
+
+
+def soft_story(modes, p0):
+    """Sum over when it ends: from the step that ends it on, the mode stays (Sigalov 2011, 1-3)."""
+    steps = len(modes) - 1
+    total = 0.0
+    for end in range(1, steps + 2):  # the step that ends it; steps + 1: none of these
+        probability = START[modes[0]]
+        for k in range(1, steps + 1):
+            before, after = modes[k - 1], modes[k]
+            if k < end:
+                probability *= p0 * MATRIX[0, before, after]
+            else:
+                probability *= (1 - p0 if k == end else 1.0) * (before == after)
+        total += probability
+    return total
+
+
+def hard_story(modes, most):
+    probability, count = START[modes[0]], 0
+    for before, after in itertools.pairwise(modes):
+        if count == most:
+            probability *= before == after
+        else:
+            probability *= MATRIX[0, before, after]
+            count += before != after
+    return probability
+
+
+@pytest.mark.parametrize("p0", [0.0, 0.4, 1.0])
+def test_the_soft_bound_tells_its_story(p0):
+    found = sequence_probabilities(soft_bound(MATRIX, START, p0), 3)
+    assert sum(found.values()) == pytest.approx(1.0, abs=1e-14)
+    for modes, probability in found.items():
+        assert probability == pytest.approx(soft_story(modes, p0), abs=1e-15)
+
+
+@pytest.mark.parametrize("most", [0, 1, 2])
+def test_the_hard_bound_tells_its_story(most):
+    found = sequence_probabilities(hard_bound(MATRIX, START, most), 3)
+    assert sum(found.values()) == pytest.approx(1.0, abs=1e-14)
+    for modes, probability in found.items():
+        assert probability == pytest.approx(hard_story(modes, most), abs=1e-15)
+
+
+def test_a_leak_brings_an_ended_mode_back():
+    chain = soft_bound(MATRIX, START, 0.9, leak=0.25)
+    np.testing.assert_allclose(chain.transition_matrix.sum(axis=-1), 1.0, atol=1e-15)
+    np.testing.assert_array_equal(chain.transition_matrix[0, 3:, :3], 0.25 * np.eye(3))
+    np.testing.assert_array_equal(chain.transition_matrix[0, 3:, 3:], 0.75 * np.eye(3))
+
+
+def test_what_cannot_be_reached_is_left_out():
+    known = np.array([1.0, 0.0])
+    two = MATRIX[:, :2, :2] / MATRIX[:, :2, :2].sum(axis=-1, keepdims=True)
+    chain = pruned(hard_bound(two, known, 4))
+    # One mode in turn for each number of transitions.
+    assert chain.mode.tolist() == [0, 1, 0, 1, 0]
+    assert chain.stage.tolist() == [0, 1, 2, 3, 4]
+    assert len(pruned(hard_bound(MATRIX, START, 4)).mode) == 15
+    assert len(pruned(soft_bound(MATRIX, START, 0.0)).mode) == 6
+    assert pruned(soft_bound(MATRIX, START, 1.0)).stage.tolist() == [0, 0, 0]
+
+
+def bound_filter(name, model, **settings):
+    """The recursion's model of an estimator, and its choices."""
+    estimator = estimators()[name]
+    chosen = estimator.settings(**settings)
+    return estimator.model(model, chosen), estimator.recursion(chosen)
+
+
+def scans(seed, steps, n_y=2, lanes=3, scale=30.0):
+    rng = np.random.default_rng(seed)
+    z = scale * rng.normal(size=(steps, n_y, lanes)).cumsum(axis=0)
+    z[rng.random((steps, 1, lanes)).repeat(n_y, axis=1) < 0.1] = np.nan
+    return z
+
+
+@pytest.mark.parametrize("initial", [(0.7, 0.3), (1.0, 0.0)])
+def test_a_soft_bound_that_never_comes_leaves_the_imm(initial):
+    model = figure_5_model()._replace(initial_mode_probabilities=np.array(initial))
+    z = scans(1, 30)
+    imm, _ = run_kernel(model, z)
+    soft, recursion = bound_filter("sbf", model, continuation_probability=1.0)
+    found, _ = run_kernel(soft, z, recursion)
+    np.testing.assert_allclose(found.mean, imm.mean, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found.mode_probabilities, imm.mode_probabilities, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("sbf", {"continuation_probability": 0.0}), ("hbf", {"most_transitions": 0})],
+)
+def test_no_transition_at_all_is_the_kalman_filter_of_the_first_mode(name, settings):
+    model = figure_5_model()._replace(initial_mode_probabilities=np.array([1.0, 0.0]))
+    z = scans(2, 40)
+    bounded, recursion = bound_filter(name, model, **settings)
+    found, _ = run_kernel(bounded, z, recursion)
+    alone, _ = run_kernel(model.only("CV"), z)
+    np.testing.assert_allclose(found.mean, alone.mean, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, alone.covariance, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found.mode_probabilities[:, 0], 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["sbf", "hbf"])
+def test_pruned_and_whole_are_one_and_equal_the_reference(name):
+    """Three modes, asymmetric, an unknown start among two of them, P0 = 0."""
+    rng = np.random.default_rng(3)
+    model = random_model(rng)._replace(
+        transition_matrix=MATRIX,
+        initial_mode_probabilities=np.array([0.6, 0.4, 0.0]),
+        initial_covariance=np.zeros((4, 4)),
+    )
+    settings = {"continuation_probability": 0.9} if name == "sbf" else {"most_transitions": 2}
+    small, recursion = bound_filter(name, model, **settings)
+    arguments = (model.transition_matrix, model.initial_mode_probabilities, *settings.values())
+    chain = soft_bound(*arguments) if name == "sbf" else hard_bound(*arguments)
+    whole = on_supermodes(model, chain)
+    assert len(small.mode_names) <= len(whole.mode_names)
+    z = scans(4, 25, scale=3.0)
+    found, _ = run_kernel(small, z, recursion)
+    unpruned, _ = run_kernel(whole, z, recursion)
+    assert np.isfinite(found.mean).all()
+    np.testing.assert_allclose(found.mean, unpruned.mean, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found.mode_probabilities, unpruned.mode_probabilities, atol=1e-8)
+    for k, (mean, _, mu, _) in enumerate(reference.bank(small, z[:, :, 0])):
+        np.testing.assert_allclose(found.mean[k, :, 0], mean, rtol=1e-8, atol=1e-8)
+        summed = [mu[np.array(small.mode_names) == mode].sum() for mode in model.mode_names]
+        np.testing.assert_allclose(found.mode_probabilities[k, :, 0], summed, atol=1e-8)
+
+
+# ---- as the truth ----------------------------------------------------------------------------
+
+
+def drawn_modes(bound, blocks=8, steps=200):
+    """Modes (steps, runs) of a chain of two modes, .92 and .92, that begins in the first."""
+    noise = np.eye(1)
+    modes = tuple(
+        Mode(name, "wiener_acceleration", {"acceleration_std_m_s2": 1.0}, noise) for name in "ab"
+    )
+    matrix = np.array([[0.92, 0.08], [0.08, 0.92]])
+    bank = ModeBank(modes, ("x", "vx", "ax"), 1, matrix, None, np.array([1.0, 0.0]))
+    truth = ChainTruth(bank, np.zeros(3), np.zeros((3, 3)), bound)
+    case = Case("chain", np.arange(steps + 1.0), truth)
+    sensor = Sensor(noise[np.newaxis], 1.0, 0)
+    spans = (slice(0, 30), slice(30, steps))
+    drawn = []
+    for block in range(blocks):
+        simulation = BlockSimulation(case, sensor, 1, 0, block, BLOCK_RUNS)
+        drawn.append(np.concatenate([simulation.advance(span).truth.mode for span in spans]))
+    return np.concatenate(drawn, axis=1)
+
+
+def transitions(modes):
+    return (np.diff(np.vstack([np.zeros_like(modes[:1]), modes]), axis=0) != 0).sum(axis=0)
+
+
+def test_a_softly_bounded_truth_stops_changing():
+    """On average 3.92 transitions for ever: 0.98 * 0.08 of the 50 steps until it ends."""
+    modes = drawn_modes(Bound(continuation_probability=0.98))
+    count = transitions(modes)
+    # A share .98^200 = 1.8 % of runs hasn't ended; those that go on are what is cut off.
+    expected = 0.98 * 0.08 * (1 - 0.98**200) / (1 - 0.98)
+    error = count.std(ddof=1) / np.sqrt(count.size)
+    assert abs(count.mean() - expected) < 4 * error  # four standard errors
+
+
+def test_a_hard_bounded_truth_changes_no_more_than_that():
+    modes = drawn_modes(Bound(most_transitions=4))
+    count = transitions(modes)
+    assert count.max() == 4
+    assert (count == 4).mean() > 0.99  # 200 steps with .08 each: fewer than 4 in 1e-4 of runs
+    assert (modes[-1][count == 4] == 0).all()  # an even number leads back
+
+
+def test_an_unbounded_truth_is_the_chain_alone():
+    count = transitions(drawn_modes(Bound()))
+    assert abs(count.mean() - 16) < 4 * count.std(ddof=1) / np.sqrt(count.size)
