@@ -53,6 +53,7 @@ def main() -> None:
         _cannot_go_on(error)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said; Python closes down
+        _drop_what_stderr_cannot_take()
         gc.freeze()  # and needn't look through all objects for garbage once more: 0.3 s
 
 
@@ -72,6 +73,14 @@ def _prepare_streams() -> None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
+
+
+def _drop_what_stderr_cannot_take() -> None:
+    """A full disk under stderr is no failure; left alone, Python ends with exit code 120 for it."""
+    try:
+        sys.stderr.flush()
+    except OSError:
+        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
 
 
 def _on_interrupt(number: int, frame: object) -> NoReturn:

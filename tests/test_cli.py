@@ -306,8 +306,9 @@ def test_streams_that_are_closed(finished):
     command = "{} " + " ".join(SMALL)
     silent = through_shell(command + " 2>&-", cwd)
     assert (silent.returncode, silent.stdout) == (0, first.stdout)
-    deaf = through_shell(command + " 2>/dev/full", cwd)
-    assert (deaf.returncode, deaf.stdout) == (0, first.stdout)
+    for buffered in ("PYTHONUNBUFFERED= ", "PYTHONUNBUFFERED=yes "):
+        deaf = through_shell(buffered + command + " 2>/dev/full", cwd)
+        assert (deaf.returncode, deaf.stdout) == (0, first.stdout)
     unheard = through_shell(command + " -q >&-", cwd)
     assert (unheard.returncode, unheard.stderr) == (0, "")
 

@@ -96,7 +96,12 @@ def test_every_estimator_runs_in_a_scenario(tmp_path):
     """The contract: found by its name, set from YAML, finite estimates in, mode by mode."""
     from hybridtrack.estimators import estimators
 
-    needed = {"kalman": "mode: turn", "rmimm": "residual_floor_m: 1"}
+    needed = {
+        "hbf": "most_transitions: 4",
+        "kalman": "mode: turn",
+        "rmimm": "residual_floor_m: 1",
+        "sbf": "continuation_probability: 0.95",
+    }
     starter = (
         config.shipped()["rmimm_fig5"].parent.parent / "hybridtrack/starter.yaml"
     ).read_text()
