@@ -76,6 +76,21 @@ struct Mixed {
 
 // ---- what both share -----------------------------------------------------------------------
 
+// x <- F x from the mixed start of mode J
+template <int J, int NX>
+void predict_mean(State<NX>& state, const Mixed<NX>& mixed, const double (&F)[NX][NX]) {
+#pragma GCC ivdep
+    for (int b = 0; b < LANES; b++) {
+        each<NX>([&](auto a) {
+            double x = 0.0;
+            each<NX>([&](auto e) {
+                if constexpr (moves(J, a, e)) x += F[a][e] * mixed.mean[J][e][b];
+            });
+            state.mean[J][a][b] = x;
+        });
+    }
+}
+
 template <int NX>
 void combine(const State<NX>& state, double* __restrict mean, double* __restrict probability) {
     for (int e = 0; e < NX; e++)
@@ -91,20 +106,11 @@ void combine(const State<NX>& state, double* __restrict mean, double* __restrict
 
 namespace textbook {
 
-// x <- F x, P <- F P F' + Q from the mixed start of mode J
+// P <- F P F' + Q, and the mean
 template <int J, int NX, int NY>
 void predict(State<NX>& state, const Mixed<NX>& mixed, const Model<NX, NY>& model) {
     auto& F = model.F[J];
-#pragma GCC ivdep
-    for (int b = 0; b < LANES; b++) {
-        each<NX>([&](auto a) {
-            double x = 0.0;
-            each<NX>([&](auto e) {
-                if constexpr (moves(J, a, e)) x += F[a][e] * mixed.mean[J][e][b];
-            });
-            state.mean[J][a][b] = x;
-        });
-    }
+    predict_mean<J>(state, mixed, F);
     each<NX>([&](auto a) {
 #pragma GCC ivdep
         for (int b = 0; b < LANES; b++) {
@@ -311,20 +317,11 @@ constexpr bool contributes(int mode, int a, int c, int e, int g) {
     return (moves(mode, a, e) && moves(mode, c, g)) || (moves(mode, a, g) && moves(mode, c, e));
 }
 
-// x <- F x, P <- F P F' + Q, each element of P in one sparse sum
+// P <- F P F' + Q, each element in one sparse sum, and the mean
 template <int J, int NX, int NY>
 void predict(State<NX>& state, const Mixed<NX>& mixed, const Model<NX, NY>& model) {
     auto& F = model.F[J];
-#pragma GCC ivdep
-    for (int b = 0; b < LANES; b++) {
-        each<NX>([&](auto a) {
-            double x = 0.0;
-            each<NX>([&](auto e) {
-                if constexpr (moves(J, a, e)) x += F[a][e] * mixed.mean[J][e][b];
-            });
-            state.mean[J][a][b] = x;
-        });
-    }
+    predict_mean<J>(state, mixed, F);
     each<NX>([&](auto a) {
         each<a + 1>([&](auto c) {
             double weight[NX][NX];

@@ -242,7 +242,7 @@ def _say_if_compiling() -> None:
 
     if not kernels_are_cached():
         say(
-            "compiling the kernels, once for this version: some twenty seconds (an interruption "
+            "compiling the kernels, once for this version: ten to twenty seconds (an interruption "
             "waits for it)"
         )
 

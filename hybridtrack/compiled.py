@@ -21,7 +21,7 @@ PACKAGE = Path(__file__).parent
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 EXACT = {"contract"}
 UNCOUNTED: dict[str, Any] = {"error_model": "numpy", "_nrt": False}
-KERNELS_MIB = 8  # 3 to 6 as compiled today
+KERNELS_MIB = 8  # about 2 as compiled today
 
 
 @functools.cache

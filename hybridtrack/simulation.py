@@ -166,7 +166,7 @@ def _drive(state, modes, noise, state_transition, input_effect, noise_root, out)
 
 def square_root(covariance: Array) -> Array:
     """L (..., n, n) with L L' = covariance, which may be singular."""
-    if covariance.size > 256:  # of many steps, and not again in the next block's way
+    if covariance.size > 256:  # many steps of their own lengths: not worth remembering
         return _square_root(covariance)
     return _known_square_root(covariance.tobytes(), covariance.shape)
 

@@ -210,6 +210,23 @@ SCENARIOS = {
 }
 
 
+def test_the_genie_is_told_modes_by_name(tmp_path):
+    """The truth counts its modes the other way round."""
+    own = """    modes:
+      rough: {motion: constant_velocity, acceleration_psd_m2_s3: 60}
+      calm: {motion: constant_velocity, acceleration_psd_m2_s3: 0.1}
+    mean_sojourn_s: {rough: 8, calm: 30}
+sensor:"""
+    text = with_genie(RANDOM).replace("sensor:", own, 1)
+    experiment = scenario(tmp_path, text, "monte_carlo.runs=40")
+    assert experiment.truth_modes == ("rough", "calm")
+    assert experiment.bank.names == ("calm", "rough")
+    result = block_of(experiment, 40)
+    correct, steps = result.sums["genie", "all", "mode_correct"]
+    np.testing.assert_array_equal(correct, steps)
+    assert steps.min() > 0
+
+
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_block_equals_the_slow_path(tmp_path, name):
     experiment = scenario(tmp_path, SCENARIOS[name])

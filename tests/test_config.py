@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hybridtrack.chains import Bound
 from hybridtrack.config import Experiment, dump, json_schema, load, shipped
 from hybridtrack.config.reader import read
 from hybridtrack.errors import UserError
@@ -925,6 +926,21 @@ def test_a_chain_with_modes_and_a_matrix_of_its_own(tmp_path: Path) -> None:
     # The scenario's matrix is for two modes and can't serve three.
     message = complaint(text.replace("    transition_matrix: [[0.5", "    #"), tmp_path / "b.yaml")
     assert "is 2 x 2 and must be 3 x 3: the modes are A, B, C" in message
+
+
+@pytest.mark.parametrize(
+    ("key", "bound"),
+    [
+        ("", Bound()),
+        ("continuation_probability: 0.9", Bound(continuation_probability=0.9)),
+        ("most_transitions: 3", Bound(most_transitions=3)),
+    ],
+)
+def test_a_chain_with_a_bound(tmp_path: Path, key: str, bound: Bound) -> None:
+    experiment = loaded(CHAIN.replace(CHAIN_START, f"{CHAIN_START}\n    {key}"), tmp_path)
+    truth = experiment.cases[0].truth
+    assert isinstance(truth, ChainTruth)
+    assert truth.bound == bound
 
 
 def test_a_chain_with_a_matrix_of_its_own_and_the_modes_of_the_scenario(tmp_path: Path) -> None:
