@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.config import Experiment, Window
-from hybridtrack.estimators import NO_KNOWN_MODES, Estimates, Prepared, Running, prepare
+from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
 from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
@@ -157,9 +157,9 @@ def _even_model(bank: _Same, step_s: float, covariance: bytes) -> JumpMarkovMode
 @functools.lru_cache(maxsize=64)
 def _prepared_for_even_steps(
     bank: _Same, step_s: float, covariance: bytes, estimator: _Same, settings: Any
-) -> Prepared:
+) -> Any:
     """An estimator for such steps, which blocks have in common too."""
-    return prepare(estimator.one, settings, _even_model(bank, step_s, covariance))
+    return estimator.one.prepare(settings, _even_model(bank, step_s, covariance))
 
 
 class _Block:
@@ -182,8 +182,8 @@ class _Block:
         )
         self._step_s = step_lengths(self._case.times_s)
         self._steps_are_even = bool((self._step_s == self._step_s[0]).all())
-        self._even: dict[str, Prepared] = {}
-        self._running: dict[str, Running] = {}
+        self._even: dict[str, Any] = {}
+        self._running: dict[str, AtWork] = {}
         chosen = experiment.estimators
         self._told = {c.label for c in chosen if c.estimator.is_told_modes(c.settings)}
         self._sheet = blank_sheet(SPAN_STEPS, self._lanes)
@@ -272,10 +272,10 @@ class _Block:
         for chosen in sorted(
             experiment.estimators, key=lambda c: c.label != experiment.compare_with
         ):
-            recursion = chosen.estimator.recursion(chosen.settings)
-            self._running[chosen.label] = Running(recursion, self._even[chosen.label], mean)
+            prepared = self._even[chosen.label]
+            self._running[chosen.label] = chosen.estimator.begin(chosen.settings, prepared, mean)
 
-    def _prepared(self, span: slice) -> dict[str, Prepared]:
+    def _prepared(self, span: slice) -> dict[str, Any]:
         """Each estimator for the steps of a span; estimators of one bank share its matrices."""
         if self._steps_are_even:
             return self._even
@@ -287,7 +287,7 @@ class _Block:
                 start = self._initial_covariances[id(bank)]
                 built[id(bank)] = bank.discretise(self._step_s[span], nothing, start)
         return {
-            c.label: prepare(c.estimator, c.settings, built[id(c.bank)])
+            c.label: c.estimator.prepare(c.settings, built[id(c.bank)])
             for c in self._experiment.estimators
         }
 
@@ -308,7 +308,7 @@ class _Block:
             self._score(span, label, scans, held, estimates)
             self._keep_estimates(span, label, running, estimates)
 
-    def _true_modes(self, running: Running, scans: Scans) -> Array:
+    def _true_modes(self, running: AtWork, scans: Scans) -> Array:
         """The truth's modes as the estimator counts them (n_steps, lanes)."""
         number = [running.mode_names.index(name) for name in self._experiment.truth_modes]
         shape = (len(scans.measurements), self._lanes)
@@ -373,7 +373,8 @@ class _Block:
             if b < self._task.runs and status[b] == 0:
                 status[b] = span.start + first + 1
             for array in estimates:
-                array[first:, ..., b] = np.nan
+                if array.shape[-1] == self._lanes:
+                    array[first:, ..., b] = np.nan
 
     # ---- tracks of the first runs ----
 
@@ -388,7 +389,7 @@ class _Block:
             self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
 
     def _keep_estimates(
-        self, span: slice, label: str, running: Running, estimates: Estimates
+        self, span: slice, label: str, running: AtWork, estimates: Estimates
     ) -> None:
         if not self._task.tracks:
             return

@@ -22,6 +22,7 @@ class Supermodes(NamedTuple):
     stage: Indices  # (n_supermodes,) 1 where ended; how many transitions there have been
     transition_matrix: Array  # (n_times, n_supermodes, n_supermodes)
     initial_probabilities: Array  # (n_supermodes,)
+    final_probability: Array  # (n_times, n_supermodes) that the mode now is the last one
 
 
 class Bound(NamedTuple):
@@ -39,7 +40,7 @@ class Bound(NamedTuple):
         if self.most_transitions is not None:
             return pruned(hard_bound(*given, self.most_transitions))
         modes = np.arange(len(initial_probabilities))
-        return Supermodes(modes, np.zeros_like(modes), *given)
+        return Supermodes(modes, np.zeros_like(modes), *given, _never_left(transition_matrix))
 
 
 def soft_bound(
@@ -54,8 +55,15 @@ def soft_bound(
     continuation_probability, (i, 0) -> (j, 0) has p0 p_ij, (i, 0) -> (i, 1) has 1 - p0; (i, 1)
     stays, but for a probability `leak` of going back to (i, 0), which is ours: without it no
     evidence frees a filter from a wrong mode that has ended.
+
+    Mode i is the last one for certain once ended, before that with (1 - p0)/(1 - p0 p_ii): it ends
+    before it is left. The leak is a guard and no belief, so it has no part in this.
     """
     n_times, n, _ = transition_matrix.shape
+    stays = np.diagonal(transition_matrix, axis1=1, axis2=2)
+    left = continuation_probability * (1.0 - stays)
+    ends = 1.0 - continuation_probability
+    final = np.divide(ends, ends + left, out=np.ones_like(left), where=ends + left > 0.0)
     same = np.eye(n)
     chain = np.zeros((n_times, 2 * n, 2 * n))
     chain[:, :n, :n] = continuation_probability * transition_matrix
@@ -67,6 +75,7 @@ def soft_bound(
         stage=np.repeat([0, 1], n),
         transition_matrix=chain,
         initial_probabilities=np.concatenate([initial_probabilities, np.zeros(n)]),
+        final_probability=np.concatenate([final, np.ones_like(final)], axis=1),
     )
 
 
@@ -77,6 +86,8 @@ def hard_bound(
 
     transition_matrix P (n_times, n, n); initial_probabilities (n,), nothing counted. (i, c) ->
     (i, c) has p_ii and (i, c) -> (j, c + 1) has p_ij while c < most_transitions; then it stays.
+
+    Mode i is the last one once so many are counted, before that only if it is never left.
     """
     n_times, n, _ = transition_matrix.shape
     stages = most_transitions + 1
@@ -90,12 +101,21 @@ def hard_bound(
     chain[:, -1, same, -1, same] = 1.0
     start = np.zeros((stages, n))
     start[0] = initial_probabilities
+    final = np.repeat(_never_left(transition_matrix)[:, np.newaxis], stages, axis=1)
+    final[:, -1] = 1.0
     return Supermodes(
         mode=np.tile(same, stages),
         stage=np.repeat(np.arange(stages), n),
         transition_matrix=chain.reshape(n_times, stages * n, stages * n),
         initial_probabilities=start.ravel(),
+        final_probability=final.reshape(n_times, stages * n),
     )
+
+
+def _never_left(transition_matrix: Array) -> Array:
+    """1 for a mode that stays for ever, 0 for one that is left some time (n_times, n)."""
+    stays = np.diagonal(transition_matrix, axis1=1, axis2=2)
+    return np.where(stays == 1.0, 1.0, 0.0)
 
 
 def pruned(supermodes: Supermodes) -> Supermodes:
@@ -110,6 +130,7 @@ def pruned(supermodes: Supermodes) -> Supermodes:
         stage=supermodes.stage[kept],
         transition_matrix=supermodes.transition_matrix[:, kept[:, np.newaxis], kept],
         initial_probabilities=supermodes.initial_probabilities[kept],
+        final_probability=supermodes.final_probability[:, kept],
     )
 
 
@@ -125,4 +146,5 @@ def on_supermodes(model: JumpMarkovModel, supermodes: Supermodes) -> JumpMarkovM
         transition_matrix=supermodes.transition_matrix,
         initial_mode_probabilities=supermodes.initial_probabilities,
         mode_names=tuple(model.mode_names[j] for j in mode),
+        final_probability=supermodes.final_probability,
     )

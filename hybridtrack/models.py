@@ -35,6 +35,8 @@ class JumpMarkovModel(NamedTuple):
     step_s: Array  # (n_times or 1,)
     mode_names: tuple[str, ...]
     state_names: tuple[str, ...]
+    # (n_times or 1, n_modes) that the mode now is the last one; None where that isn't asked
+    final_probability: Array | None = None
 
     def only(self, mode: str) -> "JumpMarkovModel":
         """The model with one of its modes alone, for a single Kalman filter."""
@@ -48,6 +50,7 @@ class JumpMarkovModel(NamedTuple):
             transition_matrix=np.ones((1, 1, 1)),
             initial_mode_probabilities=np.ones(1),
             mode_names=(mode,),
+            final_probability=None,
         )
 
 

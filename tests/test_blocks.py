@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reference
-from hybridtrack import blocks
+from hybridtrack import blocks, estimators
 from hybridtrack.blocks import (
     RAW,
     TRUTH,
@@ -396,14 +396,14 @@ def test_starts_drawn_about_the_truth_have_the_stated_covariance(tmp_path):
     )
     starts = []
 
-    class Watched(blocks.Running):
+    class Watched(estimators.Running):
         def __init__(self, recursion, first, mean):
             starts.append(mean)
             np.testing.assert_array_equal(first.model.initial_covariance, covariance)
             super().__init__(recursion, first, mean)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(blocks, "Running", Watched)
+        patch.setattr(estimators, "Running", Watched)
         for block in range(16):
             block_of(experiment, runs, block=block)
     truth = experiment.cases[0].truth.state[0]
@@ -423,7 +423,7 @@ def test_starts_drawn_about_the_truth_have_the_stated_covariance(tmp_path):
 # ---- runs that diverge -----------------------------------------------------------------------
 
 
-class Planted(blocks.Running):
+class Planted(estimators.Running):
     """Run 2 sees an impossible measurement at step 35, run 4 an enormous one at step 20."""
 
     seen = 0
@@ -441,7 +441,7 @@ def test_a_run_that_diverges_is_noted_and_harms_no_other(tmp_path, monkeypatch):
     text = SMALL.replace("detection_probability: 0.85", "detection_probability: 1")
     experiment = scenario(tmp_path, text)
     clean = block_of(experiment, 6, tracks=3)
-    monkeypatch.setattr(blocks, "Running", Planted)
+    monkeypatch.setattr(estimators, "Running", Planted)
     planted = block_of(experiment, 6, tracks=3)
     others = [0, 1, 3, 5]
     for label in ("KF", "MMAE", "IMM", "RMIMM"):

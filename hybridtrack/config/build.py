@@ -142,7 +142,7 @@ def _estimator(
     if estimator.is_told_modes(settings):
         _check_modes_can_be_told(label, truth_modes, bank, document)
     try:
-        estimator.model(banks.try_out(bank, steps_s, document, ()), settings)
+        estimator.prepare(settings, banks.try_out(bank, steps_s, document, ()))
     except ScenarioError:
         raise
     except UserError as error:

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridtrack.estimators import BankEstimator
+from hybridtrack.estimators import Estimator
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.simulation import Case, Sensor
 from hybridtrack.verdicts import Claim
@@ -36,7 +36,7 @@ class ChosenEstimator(NamedTuple):
     """An estimator of the scenario: its label there, and how it is set."""
 
     label: str
-    estimator: BankEstimator
+    estimator: Estimator
     settings: Any
     bank: ModeBank  # what it believes; one mode for a Kalman filter
 

@@ -1,7 +1,8 @@
-"""The estimators: one short file each, found by its name, all on one compiled recursion.
+"""The estimators: one short file each, found by its name, nearly all on one compiled recursion.
 
 A new estimator is one file here that defines ESTIMATOR. Its settings are a NamedTuple with types
-and defaults; the scenario's checked form is derived from it.
+and defaults; the scenario's checked form is derived from it. One that isn't a choice of the
+recursion (a BankEstimator) needs its own `prepare` and `begin`; blocks of runs know no more of any.
 """
 
 import functools
@@ -9,7 +10,9 @@ import importlib
 import pkgutil
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
 
 from hybridtrack.estimators import _bank, _layout
 from hybridtrack.estimators._bank import NO_KNOWN_MODES, Recursion
@@ -18,13 +21,69 @@ from hybridtrack.models import JumpMarkovModel
 
 __all__ = [
     "NO_KNOWN_MODES",
+    "AtWork",
     "BankEstimator",
     "Estimates",
-    "Prepared",
+    "Estimator",
     "Running",
     "estimators",
-    "prepare",
 ]
+
+
+class AtWork(Protocol):
+    """An estimator at work on one block of runs; remembers its state between spans."""
+
+    mode_names: tuple[str, ...]
+    state_names: tuple[str, ...]
+
+    def advance(
+        self,
+        prepared: Any,
+        measurements: Array,
+        *,
+        covariance: bool = False,
+        known_modes: Array = NO_KNOWN_MODES,
+    ) -> Estimates:
+        """Filter a span: measurements (n_steps, n_y, lanes), NaN where missed.
+
+        known_modes (n_steps, lanes): the index of the true mode, where it is to be told.
+
+        The estimates live in memory that the thread's next call, of any estimator, may overwrite:
+        what is used at once is still in the cache.
+        """
+        ...
+
+
+class Estimator(Protocol):
+    """What a scenario can choose by its name."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def summary(self) -> str: ...
+    @property
+    def source(self) -> str: ...
+    @property
+    def settings(self) -> type[Any]:
+        """A NamedTuple: types, and defaults where there are any."""
+        ...
+
+    @property
+    def limits(self) -> Mapping[str, tuple[float | None, float | None]]:
+        """Smallest and largest value by setting."""
+        ...
+
+    def is_told_modes(self, settings: Any) -> bool:
+        """Whether it has to be given the true modes."""
+        ...
+
+    def prepare(self, settings: Any, model: JumpMarkovModel) -> Any:
+        """What it makes of a bank's model for some steps; kept for all blocks with such steps."""
+        ...
+
+    def begin(self, settings: Any, prepared: Any, initial_mean: Array) -> AtWork:
+        """Start on a block: `prepared` for its first span, initial_mean (n_x, lanes)."""
+        ...
 
 
 class BankEstimator(NamedTuple):
@@ -42,9 +101,18 @@ class BankEstimator(NamedTuple):
         """Whether it has to be given the true modes."""
         return self.recursion(settings).interaction == _bank.INHERIT
 
+    def prepare(self, settings: Any, model: JumpMarkovModel) -> "Prepared":
+        """The model on its own chain, as it is and as the kernel wants it."""
+        own = self.model(model, settings)
+        return Prepared(own, _layout.kernel_model(own))
+
+    def begin(self, settings: Any, prepared: "Prepared", initial_mean: Array) -> "Running":
+        """The recursion at k = 0."""
+        return Running(self.recursion(settings), prepared, initial_mean)
+
 
 @functools.cache
-def estimators() -> Mapping[str, BankEstimator]:
+def estimators() -> Mapping[str, Estimator]:
     """Every estimator by its name, in alphabetical order."""
     found = {}
     for module in pkgutil.iter_modules(__path__):
@@ -55,20 +123,14 @@ def estimators() -> Mapping[str, BankEstimator]:
 
 
 class Prepared(NamedTuple):
-    """An estimator's model for some steps, as it is and as the kernel wants it."""
+    """A bank's model for some steps, as it is and as the kernel wants it."""
 
     model: JumpMarkovModel
     kernel: _layout.KernelModel
 
 
-def prepare(estimator: BankEstimator, settings: Any, model: JumpMarkovModel) -> Prepared:
-    """The estimator's own model of a bank's. Worth keeping for every block with these steps."""
-    own = estimator.model(model, settings)
-    return Prepared(own, _layout.kernel_model(own))
-
-
 class Running:
-    """One estimator at work on one block of runs; remembers its state between spans."""
+    """The recursion at work; see AtWork."""
 
     def __init__(self, recursion: Recursion, first: Prepared, initial_mean: Array) -> None:
         """first: for the first span; initial_mean (n_x, lanes)."""
@@ -76,6 +138,7 @@ class Running:
         self._model = first.model
         self._lanes = initial_mean.shape[1]
         self._state = _layout.start(first.model, self._lanes, initial_mean)
+        self._prior = first.model.initial_mode_probabilities.copy()
         self.mode_names = _layout.output_modes(first.model)
         self.state_names = first.model.state_names
 
@@ -87,13 +150,7 @@ class Running:
         covariance: bool = False,
         known_modes: Array = NO_KNOWN_MODES,
     ) -> Estimates:
-        """Filter a span: measurements (n_steps, n_y, lanes), NaN where missed.
-
-        known_modes (n_steps, lanes): the index of the true mode, where it is to be told.
-
-        The estimates live in memory that the thread's next call, of any estimator, overwrites:
-        what is used at once is still in the cache.
-        """
+        """See AtWork."""
         room = _memory.room(
             self._model, len(measurements), self._lanes, len(self.mode_names) > 1, covariance
         )
@@ -101,6 +158,9 @@ class Running:
         _bank.run_span(
             self._state, work, prepared.kernel, self._recursion, measurements, room, known_modes
         )
+        if len(room.final_mode_prior):
+            scratch = np.empty_like(self._prior)
+            _bank.foresee(self._prior, scratch, prepared.kernel, room.final_mode_prior)
         return room
 
 
@@ -121,7 +181,8 @@ class _Memory(threading.local):
         self, model: JumpMarkovModel, steps: int, lanes: int, likelihoods: bool, covariance: bool
     ) -> Estimates:
         outputs = len(set(model.mode_names))
-        size = (model.measurement_matrix.shape, outputs, lanes, likelihoods, covariance)
+        final = model.final_probability is not None
+        size = (model.measurement_matrix.shape, outputs, lanes, likelihoods, covariance, final)
         kept = self._rooms.get(size)
         if kept is None or len(kept.mean) < steps:
             kept = self._rooms[size] = _layout.empty_estimates(

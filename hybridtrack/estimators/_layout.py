@@ -17,6 +17,8 @@ from hybridtrack.vectors import WIDTH, aligned_zeros, vectors
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+NO_ROWS: Array = np.zeros((0, 1))
+
 
 class SparseMaps(NamedTuple):
     """A matrix for each mode without the elements that are always zero, row after row."""
@@ -42,6 +44,7 @@ class KernelModel(NamedTuple):
     decorrelated_variance: Array  # D (n_modes, n_y)
     component: Indices  # (n_modes, n_y) the one state in a row of L^-1 H; -1: several
     output_mode: Indices  # (n_modes,) where a mode's probability is added
+    final_probability: Array  # (n_times or 1, n_modes); (0, n_modes) where it isn't asked
 
 
 class BankState(NamedTuple):
@@ -79,6 +82,8 @@ class Estimates(NamedTuple):
     mode_probabilities: Array  # (n_steps, n_output_modes, lanes)
     mode_likelihoods: Array  # (n_steps, n_output_modes, lanes) N_j Lambda_j, summing to 1
     covariance: Array  # (n_steps, n_packed, lanes) or (0, n_packed, lanes)
+    final_mode_probability: Array = NO_ROWS  # (n_steps, lanes) that the mode now is the last one
+    final_mode_prior: Array = NO_ROWS  # (n_steps, 1) the same before any scan, by the time alone
 
 
 # ---- as vectors ------------------------------------------------------------------------------
@@ -186,11 +191,14 @@ def empty_estimates(
     n_x = len(model.state_names)
     n_modes = len(output_modes(model))
     likelihoods = likelihoods and n_modes == len(model.mode_names)
+    final = steps if model.final_probability is not None else 0
     return Estimates(
         mean=aligned_zeros(steps, n_x, lanes),
         mode_probabilities=aligned_zeros(steps, n_modes, lanes),
         mode_likelihoods=aligned_zeros(steps if likelihoods else 0, n_modes, lanes),
         covariance=aligned_zeros(steps if covariance else 0, n_x * (n_x + 1) // 2, lanes),
+        final_mode_probability=aligned_zeros(final, lanes),
+        final_mode_prior=aligned_zeros(final, 1),
     )
 
 
@@ -232,6 +240,11 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
         decorrelated_variance=variance,
         component=_only_nonzero(decorrelated),
         output_mode=np.array([names.index(name) for name in model.mode_names], dtype=np.int64),
+        final_probability=(
+            np.zeros((0, n_modes))
+            if model.final_probability is None
+            else np.ascontiguousarray(model.final_probability)
+        ),
     )
 
 
