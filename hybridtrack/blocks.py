@@ -12,7 +12,7 @@ from hybridtrack.config import Experiment, Window
 from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
-from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
+from hybridtrack.scoring import Given, Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
@@ -27,9 +27,12 @@ from hybridtrack.simulation import (
 from hybridtrack.statistics import (
     Moments,
     SumMoments,
+    VectorMoments,
     merge_moments,
     merge_sum_moments,
+    merge_vectors,
     sum_moments,
+    vector_moments,
 )
 from hybridtrack.tallies import Tally
 from hybridtrack.vectors import WIDTH
@@ -71,6 +74,7 @@ class BlockResult(NamedTuple):
     task: BlockTask
     steps: dict[Series, Moments]  # arrays (n_steps,)
     sums: dict[Cell, tuple[Array, Array]]  # (runs,) sums over steps, and their numbers
+    final_bins: dict[str, Array]  # by estimator (3 * BINS, runs), see tallies.Totals
     status: dict[str, NDArray[np.int64]]  # by estimator (runs,): 0, or the step of divergence
     tracks: list[Track]
 
@@ -80,6 +84,7 @@ class GroupStatistics(NamedTuple):
 
     steps: dict[Series, Moments]
     windows: dict[Cell, SumMoments]
+    final_bins: dict[str, VectorMoments]
     diverged: dict[str, int]
 
 
@@ -93,6 +98,7 @@ def merge(a: GroupStatistics, b: GroupStatistics) -> GroupStatistics:
     return GroupStatistics(
         _merged(a.steps, b.steps, merge_moments),
         _merged(a.windows, b.windows, merge_sum_moments),
+        {label: merge_vectors(a.final_bins[label], b.final_bins[label]) for label in a.final_bins},
         {key: a.diverged[key] + b.diverged[key] for key in a.diverged},
     )
 
@@ -115,8 +121,12 @@ def summarise(result: BlockResult) -> GroupStatistics:
         sound = {label: status == 0 for label, status in result.status.items()}
         moments = sum_moments(sums, numbers, np.array([sound[cell[0]] for cell in result.sums]))
         windows = dict(zip(result.sums, map(SumMoments, *moments), strict=True))
+    final_bins = {
+        label: vector_moments(sums, result.status[label] == 0)
+        for label, sums in result.final_bins.items()
+    }
     diverged = {label: int((status > 0).sum()) for label, status in result.status.items()}
-    return GroupStatistics(result.steps, windows, diverged)
+    return GroupStatistics(result.steps, windows, final_bins, diverged)
 
 
 def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) -> NDArray[np.bool_]:
@@ -179,6 +189,7 @@ class _Block:
             task.case,
             task.block,
             self._lanes,
+            foresees=experiment.foresees,
         )
         self._step_s = step_lengths(self._case.times_s)
         self._steps_are_even = bool((self._step_s == self._step_s[0]).all())
@@ -192,6 +203,8 @@ class _Block:
             name: Moments(*(np.zeros(self._n_steps) for _ in range(3)))
             for name in experiment.truth_modes
         }
+        if experiment.foresees:
+            self._final_share = Moments(*(np.zeros(self._n_steps) for _ in range(3)))
         labels = (RAW, *(chosen.label for chosen in experiment.estimators))
         self._status = {label: np.zeros(task.runs, dtype=np.int64) for label in labels}
         self._tracks: dict[tuple[int, str, str], Array] = {}
@@ -222,15 +235,20 @@ class _Block:
         steps: dict[Series, Moments] = {
             (TRUTH, f"mode_probability:{name}"): moments for name, moments in self._shares.items()
         }
+        if self._experiment.foresees:
+            steps[TRUTH, "final_mode_probability"] = self._final_share
         sums: dict[Cell, tuple[Array, Array]] = {}
+        final_bins: dict[str, Array] = {}
         for label in self._status:  # in the scenario's order
             if label in self._tallies:
                 tally = self._tallies[label]
                 steps |= {(label, quantity): moments for quantity, moments in tally.steps()}
                 sums |= {(label, *cell): totals for cell, totals in tally.sums()}
+                if tally.final_bins.size:
+                    final_bins[label] = tally.final_bins
         kept = sorted(self._tracks.items(), key=lambda item: self._place(item[0][1]))
         tracks = [Track(*key, values) for key, values in kept]
-        return BlockResult(self._task, steps, sums, self._status, tracks)
+        return BlockResult(self._task, steps, sums, final_bins, self._status, tracks)
 
     def _place(self, label: str) -> int:
         """A label's place in the scenario's order; truth and measurements come first."""
@@ -336,16 +354,15 @@ class _Block:
             running.mode_names if running else (),
         )
         leading = self._tallies.get(experiment.compare_with or "")
-        return Tally(
-            names,
-            self._n_steps,
-            tuple(window.name for window in experiment.windows),
-            self._sheet,
-            self._task.runs,
+        given = Given(
             likelihoods=len(estimates.mode_likelihoods) > 0,
+            final=len(estimates.final_mode_probability) > 0,
             leads=label == experiment.compare_with,
             compared=leading is not None and leading.has_advantage,
+            paired=leading is not None,
         )
+        windows = tuple(window.name for window in experiment.windows)
+        return Tally(names, self._n_steps, windows, self._sheet, self._task.runs, given)
 
     def _windows(self, span: slice, truth: TruthSpan) -> NDArray[np.bool_]:
         """Which windows hold a span's steps (n_steps, n_windows, lanes or 1)."""
@@ -354,13 +371,18 @@ class _Block:
         return np.stack([inside(w, times_s, span.start, truth) for w in windows], axis=1)
 
     def _note_shares(self, span: slice, truth: TruthSpan) -> None:
-        """Moments of the truth's being in each of its modes."""
-        runs = self._task.runs
+        """Moments of the truth's being in each of its modes, and in its last one."""
         for j, moments in enumerate(self._shares.values()):
-            share = (truth.mode[:, :runs] == j).mean(axis=1)
-            moments.n[span] = runs
-            moments.mean[span] = share
-            moments.squares[span] = runs * share * (1.0 - share)
+            self._note_share(span, moments, truth.mode == j)
+        if self._experiment.foresees:
+            self._note_share(span, self._final_share, truth.final)
+
+    def _note_share(self, span: slice, moments: Moments, ones: NDArray[Any]) -> None:
+        runs = self._task.runs
+        share = ones[:, :runs].mean(axis=1)
+        moments.n[span] = runs
+        moments.mean[span] = share
+        moments.squares[span] = runs * share * (1.0 - share)
 
     def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
         """Note the step at which a run diverges; from there on its estimates are NaN."""
@@ -401,6 +423,9 @@ class _Block:
             for j, name in enumerate(running.mode_names):
                 values = estimates.mode_probabilities[:, j]
                 self._keep(span, label, f"mode_probability:{name}", values)
+        if len(estimates.final_mode_probability):
+            values = estimates.final_mode_probability
+            self._keep(span, label, "final_mode_probability", values)
 
     def _keep(self, span: slice, label: str, quantity: str, values: Array) -> None:
         for run in range(self._task.tracks):

@@ -51,6 +51,17 @@ SCHEMAS = {
             ("n_pairs", pa.int64()),
         ]
     ),
+    "reliability": pa.schema(
+        [
+            ("estimator", pa.string()),
+            ("from_probability", pa.float64()),
+            ("to_probability", pa.float64()),
+            ("share_of_steps", pa.float64()),
+            ("mean_probability", pa.float64()),
+            ("frequency", pa.float64()),
+            ("standard_error", pa.float64()),
+        ]
+    ),
     "published": pa.schema(
         [
             ("claim", pa.string()),

@@ -27,7 +27,7 @@ from hybridtrack.config import Experiment, dump
 from hybridtrack.executors import in_order
 from hybridtrack.results import RunFolder
 from hybridtrack.simulation import BLOCK_RUNS
-from hybridtrack.statistics import Moments, SumMoments
+from hybridtrack.statistics import Moments, SumMoments, VectorMoments
 
 SHARD_BLOCKS = 8  # blocks whose statistics are put away together
 
@@ -114,6 +114,7 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
         folder.write_table("tracks", outcomes.tracks_rows(experiment, tracks))
         folder.write_table("summary", outcomes.summary_rows(experiment, merged))
         folder.write_table("comparisons", outcomes.comparisons_rows(experiment, pairs))
+        folder.write_table("reliability", outcomes.reliability_rows(experiment, merged))
         folder.write_table("published", outcomes.published_rows(experiment, pairs, merged))
         manifest |= {
             "finished": _now(),
@@ -191,6 +192,7 @@ def _pack(group: GroupStatistics, tracks: list[Track]) -> dict[str, Any]:
     keys = {
         "steps": [list(key) for key in group.steps],
         "windows": [list(key) for key in group.windows],
+        "final_bins": list(group.final_bins),
         "diverged": group.diverged,
         "tracks": [[t.run, t.estimator, t.quantity] for t in tracks],
     }
@@ -199,6 +201,10 @@ def _pack(group: GroupStatistics, tracks: list[Track]) -> dict[str, Any]:
         "steps": np.array([list(moments) for moments in group.steps.values()]),
         "windows": np.array([list(moments) for moments in group.windows.values()], dtype=float),
         "tracks": np.array([track.values for track in tracks]),
+        **{
+            f"final_{field}": np.array([getattr(m, field) for m in group.final_bins.values()])
+            for field in VectorMoments._fields
+        },
     }
 
 
@@ -209,11 +215,16 @@ def _unpack(arrays: dict[str, Any]) -> tuple[GroupStatistics, list[Track]]:
         (k[0], k[1], k[2]): SumMoments(*a)
         for k, a in zip(keys["windows"], arrays["windows"], strict=True)
     }
+    bins = zip(*(arrays[f"final_{field}"] for field in VectorMoments._fields), strict=True)
+    final_bins = {
+        label: VectorMoments(*moments)
+        for label, moments in zip(keys["final_bins"], bins, strict=True)
+    }
     tracks = [
         Track(int(k[0]), str(k[1]), str(k[2]), a)
         for k, a in zip(keys["tracks"], arrays["tracks"], strict=True)
     ]
-    return GroupStatistics(steps, windows, keys["diverged"]), tracks
+    return GroupStatistics(steps, windows, final_bins, keys["diverged"]), tracks
 
 
 # ---- what made it ----------------------------------------------------------------------------

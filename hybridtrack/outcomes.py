@@ -1,7 +1,7 @@
 """From merged statistics to the rows of a run folder's tables, verdicts among them."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +20,18 @@ from hybridtrack.statistics import (
     QUANTITIES,
     Estimate,
     Metric,
+    Moments,
     Paired,
-    PairMoments,
+    Reliability,
     RunSums,
+    VectorMoments,
     compare,
-    merge_pairs,
+    merge_vectors,
     pair_moments,
     ratio_of_sums,
+    reliability,
 )
+from hybridtrack.tallies import DIFFERENCE
 from hybridtrack.verdicts import Claim, Outcome, judge_comparison, judge_figure
 
 
@@ -72,11 +76,49 @@ def _step_metrics(quantity: str) -> list[tuple[str, bool]]:
     return found or [(quantity, False)]
 
 
+def _ratio_by_step(first: Moments, second: Moments, difference: Moments) -> dict[str, Any]:
+    """Ratio of two means over the same runs, step by step, with paired standard errors.
+
+    By the delta method, from the variances of both and of their difference. NaN where a run
+    diverged under either.
+    """
+    n = second.n
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where((first.n == n) & (difference.n == n), first.mean / second.mean, np.nan)
+        spread = (1 - ratio) * first.squares + ratio * (ratio - 1) * second.squares
+        spread += ratio * difference.squares
+        error = np.sqrt(np.maximum(spread, 0.0) / (n * (n - 1))) / second.mean
+    error[n < 2] = np.nan
+    return {"value": ratio, "standard_error": error}
+
+
+def _ratio_rows(
+    experiment: Experiment, group: GroupStatistics, label: str, quantity: str
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The ratio to the estimator that `compare_with` names, of mean squares and of their roots."""
+    leading = experiment.compare_with
+    assert leading is not None
+    three = [(label, quantity), (leading, quantity), (label, quantity + DIFFERENCE)]
+    squares = _ratio_by_step(*(group.steps[key] for key in three))
+    root = np.sqrt(squares["value"])
+    kind = quantity.partition("_")[0]
+    yield f"{kind}_mse_ratio", squares
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = squares["standard_error"] / (2 * root)
+    yield f"{kind}_rmse_ratio", {"value": root, "standard_error": error}
+
+
 def steps_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
     parts = []
     for case, group in zip(experiment.cases, cases, strict=True):
         times_s = case.times_s[1:]
         for (label, quantity), moments in group.steps.items():
+            if quantity.endswith(DIFFERENCE):
+                of = quantity.removesuffix(DIFFERENCE)
+                for metric, numbers in _ratio_rows(experiment, group, label, of):
+                    texts = {"case": case.name, "estimator": label, "metric": metric}
+                    parts.append((texts, _by_step(times_s) | numbers))
+                continue
             n = moments.n
             with np.errstate(invalid="ignore", divide="ignore"):
                 mean = np.where(n > 0, moments.mean, np.nan)
@@ -137,13 +179,34 @@ def summary_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
                 estimate = _pooled(cases, label, window.name, metric)
                 if not math.isnan(estimate.value):
                     rows.append((label, name, window.name, *estimate))
+    for label, found in _reliabilities(experiment, cases).items():
+        rows.append((label, CALIBRATION, experiment.windows[0].name, *found.calibration_error))
     return _columns("summary", rows)
+
+
+def _reliabilities(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Reliability]:
+    """Of the probability that the mode now is the last one, for the estimators that tell it."""
+    told = [label for label in labels(experiment) if label in cases[0].final_bins]
+    return {label: reliability([group.final_bins[label] for group in cases]) for label in told}
+
+
+def reliability_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
+    rows = []
+    for label, found in _reliabilities(experiment, cases).items():
+        bins = found.share.size
+        for i in range(bins):
+            rows.append(
+                (label, i / bins, (i + 1) / bins, *(float(array[i]) for array in found[:4]))
+            )
+    return _columns("reliability", rows)
 
 
 def _columns(table: str, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
     names = columns.SCHEMAS[table].names
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
+
+CALIBRATION = "final_mode_calibration_error"
 
 Pair = tuple[str, str, str]  # first and second estimator, window
 
@@ -153,7 +216,7 @@ class Pairs:
 
     def __init__(self, wanted: Iterable[Pair]) -> None:
         # By case; leading axis of the moments: QUANTITIES.
-        self._moments: dict[Pair, dict[int, PairMoments]] = {pair: {} for pair in wanted}
+        self._moments: dict[Pair, dict[int, VectorMoments]] = {pair: {} for pair in wanted}
 
     def add(self, runs: pa.Table) -> None:
         """The runs of the next shard, as runs.parquet has them.
@@ -178,7 +241,7 @@ class Pairs:
                 for i in (labels.index(first), labels.index(second))
             )
             moments = pair_moments(one, two)
-            by_case[case] = merge_pairs(by_case[case], moments) if case in by_case else moments
+            by_case[case] = merge_vectors(by_case[case], moments) if case in by_case else moments
 
     def compare(self, pair: Pair, metric: str) -> Paired:
         """A metric of a pair; where one is raw, at the scans that it has."""
@@ -186,7 +249,7 @@ class Pairs:
         if RAW in pair[:2] and quantity == POSITION:  # no measurement where the scan is missed
             quantity = POSITION_AT_SCANS
         q = QUANTITIES.index(quantity)
-        cases = [PairMoments(*(of[q] for of in case)) for case in self._moments[pair].values()]
+        cases = [VectorMoments(*(of[q] for of in case)) for case in self._moments[pair].values()]
         return compare(cases, root)
 
 

@@ -13,20 +13,22 @@ from numpy.typing import NDArray
 from hybridtrack.compiled import lane_kernel, row_kernel, short_kernel
 from hybridtrack.estimators import Estimates
 from hybridtrack.models import Array
-from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES
+from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES, VELOCITY
 from hybridtrack.vectors import aligned_zeros
 
 ROUNDING = 1e-9  # likelihoods sum to 1; two filters that are one in theory differ by less
 
 POSITION_ROW = QUANTITIES.index(POSITION)
 AT_SCANS_ROW = QUANTITIES.index(POSITION_AT_SCANS)
-VELOCITY_ROW = QUANTITIES.index("velocity_squared_error_m2_s2")
+VELOCITY_ROW = QUANTITIES.index(VELOCITY)
 CORRECT_ROW = QUANTITIES.index("mode_correct")
 BRIER_ROW = QUANTITIES.index("mode_brier")
 TRUE_MODE_ROW = QUANTITIES.index("true_mode_probability")
 DISTINCTNESS_ROW = QUANTITIES.index("likelihood_distinctness")
 KEPT = "likelihood_advantage_kept"
 KEPT_ROW = QUANTITIES.index(KEPT)
+FINAL_ROW = QUANTITIES.index("final_mode_brier")
+FINAL_PRIOR_ROW = QUANTITIES.index("final_mode_prior_brier")
 
 Integers = NDArray[np.int64]
 
@@ -56,24 +58,35 @@ class Names(NamedTuple):
         return np.array([*table, -1], dtype=np.int64)  # the truth's -1, no mode, finds the last
 
 
-def defined(names: Names, *, likelihoods: bool, compared: bool) -> tuple[str, ...]:
-    """The quantities that exist, in the order in which they are tallied.
+class Given(NamedTuple):
+    """What estimates hold besides means and mode probabilities, and what there is beside them."""
 
-    likelihoods: the estimates hold its modes' likelihoods; compared: those of the estimator that
-    `compare_with` names, which may be this one, can be compared with them.
-    """
+    likelihoods: bool = False  # of the modes
+    final: bool = False  # the probability that the mode now is the last one
+    leads: bool = False  # `compare_with` names this estimator, tallied before the others
+    compared: bool = False  # the leading one has likelihoods too, whose advantage can be compared
+    paired: bool = False  # there is another leading one, whose errors can be
+
+
+NOTHING_MORE = Given()
+
+
+def defined(names: Names, given: Given) -> tuple[str, ...]:
+    """The quantities that exist, in the order in which they are tallied."""
     modes = bool(names.scored_modes)
     common = bool({*names.truth_modes} & {*names.scored_modes})
     position = bool(len(names.axes("")))
     exists = {
         POSITION: position,
-        "velocity_squared_error_m2_s2": bool(len(names.axes("v"))),
+        VELOCITY: bool(len(names.axes("v"))),
         POSITION_AT_SCANS: position,
-        "likelihood_distinctness": modes and likelihoods,
+        "likelihood_distinctness": modes and given.likelihoods,
         "mode_correct": common,
         "mode_brier": common,
         "true_mode_probability": common,
-        KEPT: common and likelihoods and compared,
+        KEPT: common and given.likelihoods and (given.leads or given.compared),
+        "final_mode_brier": given.final and bool(names.truth_modes),
+        "final_mode_prior_brier": given.final and bool(names.truth_modes),
     }
     return tuple(quantity for quantity in exists if exists[quantity])
 
@@ -86,8 +99,10 @@ class Layout(NamedTuple):
     velocity: Integers  # (n_axes, 2)
     true_mode: Integers  # (n_truth_modes + 1,) the estimator's mode by the truth's; -1 for none
     modes: int  # how many are scored
-    likelihoods: bool  # whether the estimates hold them
-    leads: bool  # whether the others' advantage is compared with this one's
+    likelihoods: bool  # these three: see Given
+    leads: bool
+    paired: bool
+    final: bool  # whether it is there and can be scored
 
 
 class Sheet(NamedTuple):
@@ -96,20 +111,25 @@ class Sheet(NamedTuple):
     rows: Array  # (n_quantities, lanes) in the order of QUANTITIES
     scratch: Array  # (4, lanes)
     true_mode: Integers  # (lanes,) as the estimator counts them
-    leading: Array  # (n_steps, lanes) likelihood advantage under `compare_with`, for a whole span
+    # Of the estimator that `compare_with` names, for a whole span (n_steps, lanes):
+    leading: Array  # likelihood advantage
+    leading_position: Array  # squared errors
+    leading_velocity: Array
 
 
-def layout(names: Names, *, likelihoods: bool, leads: bool, compared: bool) -> Layout:
-    """The arguments are those of `defined`; leads: see Layout."""
-    quantities = defined(names, likelihoods=likelihoods, compared=compared)
+def layout(names: Names, given: Given) -> Layout:
+    """The same arguments for the kernels."""
+    quantities = defined(names, given)
     return Layout(
         tallied=np.array([QUANTITIES.index(q) for q in quantities], dtype=np.int64),
         position=names.axes(""),
         velocity=names.axes("v"),
         true_mode=names.true_mode(),
         modes=len(names.scored_modes),
-        likelihoods=likelihoods,
-        leads=leads,
+        likelihoods=given.likelihoods,
+        leads=given.leads,
+        paired=given.paired,
+        final=given.final and bool(names.truth_modes),
     )
 
 
@@ -120,6 +140,8 @@ def blank_sheet(span_steps: int, lanes: int) -> Sheet:
         scratch=aligned_zeros(4, lanes),
         true_mode=aligned_zeros(lanes).view(np.int64),
         leading=aligned_zeros(span_steps, lanes),
+        leading_position=aligned_zeros(span_steps, lanes),
+        leading_velocity=aligned_zeros(span_steps, lanes),
     )
 
 
@@ -263,6 +285,32 @@ def compare_advantages(kept, own, leading):
         kept[b] = enough if known else np.nan
 
 
+@lane_kernel
+def score_final_mode(brier, prior_brier, probability, prior, final):
+    """Squared errors of the posterior and of the prior; final (lanes,), or (1,)."""
+    for b in range(brier.size):
+        brier[b] = probability[b]
+        prior_brier[b] = prior
+    if final.size == 1:
+        for b in range(brier.size):
+            brier[b] -= final[0]
+            prior_brier[b] -= final[0]
+    else:
+        for b in range(brier.size):
+            brier[b] -= final[b]
+        for b in range(brier.size):
+            prior_brier[b] -= final[b]
+    for b in range(brier.size):
+        brier[b] *= brier[b]
+        prior_brier[b] *= prior_brier[b]
+
+
+@row_kernel
+def subtract(out, row, other):
+    for b in range(out.size):
+        out[b] = row[b] - other[b]
+
+
 @row_kernel
 def fill_sheet(sheet, layout, k, scans, estimates, missed):
     """Every quantity of step k of a span; what isn't defined is left as it is.
@@ -301,6 +349,18 @@ def fill_sheet(sheet, layout, k, scans, estimates, missed):
             if layout.leads:
                 copy(sheet.leading[k], advantage)
             compare_advantages(rows[KEPT_ROW], advantage, sheet.leading[k])
+    if layout.final:
+        score_final_mode(
+            rows[FINAL_ROW],
+            rows[FINAL_PRIOR_ROW],
+            estimates.final_mode_probability[k],
+            estimates.final_mode_prior[k, 0],
+            truth.final[k],
+        )
+    if layout.leads and layout.position.shape[0]:
+        copy(sheet.leading_position[k], rows[POSITION_ROW])
+    if layout.leads and layout.velocity.shape[0]:
+        copy(sheet.leading_velocity[k], rows[VELOCITY_ROW])
 
 
 @short_kernel

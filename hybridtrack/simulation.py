@@ -7,7 +7,7 @@ depends neither on how many runs were asked for nor on the length of spans.
 
 import enum
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,8 @@ from hybridtrack.models import Array, JumpMarkovModel, ModeBank
 BLOCK_RUNS = 256  # runs drawn and filtered together
 
 Modes = NDArray[np.int64]
+NOT_FORESEEN: Array = np.zeros((0, 1))
+FORESEEN_STEPS = 75  # at a time
 
 
 class Purpose(enum.IntEnum):
@@ -122,10 +124,15 @@ class TruthSpan(NamedTuple):
     state: Array  # (n_steps, n_states, lanes or 1)
     mode: Modes  # (n_steps, lanes or 1), -1 where there is none
     since_switch_s: Array  # (n_steps, lanes or 1) since the last switch of mode; inf before it
+    final: Array = NOT_FORESEEN  # (n_steps, lanes or 1) 1 where no switch comes any more, else 0
 
     def cut(self, steps: slice) -> "TruthSpan":
         """Some of the steps."""
-        return TruthSpan(self.state[steps], self.mode[steps], self.since_switch_s[steps])
+        return self.each(lambda array: array[steps])
+
+    def each(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> "TruthSpan":
+        """The same change of every array."""
+        return TruthSpan(*map(change, self))
 
 
 @kernel
@@ -138,6 +145,23 @@ def _draw_modes(mode, uniform, cumulative, out):
                 j += 1
             mode[b] = j
             out[k, b] = j
+
+
+def _advance_modes(chain: Supermodes, supermode: Modes, uniform: Array) -> tuple[Modes, Modes]:
+    """The modes before a span and in it (n_steps, runs); `supermode` (runs,) moves along."""
+    supermodes = np.empty(uniform.shape, dtype=np.int64)
+    before = chain.mode[supermode]
+    _draw_modes(supermode, uniform, np.cumsum(chain.transition_matrix, axis=-1), supermodes)
+    return before, chain.mode[supermodes]
+
+
+@kernel
+def _note_switches(before, modes, start, last):
+    for k in range(modes.shape[0]):
+        for b in range(modes.shape[1]):
+            earlier = before[b] if k == 0 else modes[k - 1, b]
+            if modes[k, b] != earlier:
+                last[b] = start + k + 1
 
 
 @kernel
@@ -237,9 +261,20 @@ class BlockSimulation:
     """Truth and measurements of one block of runs, span by span."""
 
     def __init__(
-        self, case: Case, sensor: Sensor, seed: int, case_index: int, block: int, lanes: int
+        self,
+        case: Case,
+        sensor: Sensor,
+        seed: int,
+        case_index: int,
+        block: int,
+        lanes: int,
+        *,
+        foresees: bool = False,
     ) -> None:
-        """lanes: how many of the block's runs are kept of what is drawn."""
+        """lanes: how many of the block's runs are kept of what is drawn.
+
+        foresees: whether to tell at every step if the mode is the last one.
+        """
         self._lanes = lanes
         self._case = case
         self._sensor = sensor
@@ -265,6 +300,7 @@ class BlockSimulation:
             self._supermode: Modes = np.searchsorted(cumulative, uniform, side="right")
             self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
             self.initial_state = self._state[:, :lanes].copy()
+            self._last_switch = self._last_switches() if foresees else None
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
@@ -273,6 +309,7 @@ class BlockSimulation:
                 truth.state[1:, :, np.newaxis],
                 truth.mode[1:, np.newaxis],
                 since_switch_s[1:, np.newaxis],
+                _final(truth.mode)[1:, np.newaxis] if foresees else NOT_FORESEEN,
             )
         self._positions = [
             self.state_names.index(axis) for axis in "xy" if axis in self.state_names
@@ -293,11 +330,7 @@ class BlockSimulation:
         """Truth and measurements of the next span of steps."""
         truth, measurements = self._draw(span)
         lanes = self._lanes
-        kept = TruthSpan(
-            np.ascontiguousarray(truth.state[..., :lanes]),
-            np.ascontiguousarray(truth.mode[..., :lanes]),
-            np.ascontiguousarray(truth.since_switch_s[..., :lanes]),
-        )
+        kept = truth.each(lambda array: np.ascontiguousarray(array[..., :lanes]))
         return Scans(kept, np.ascontiguousarray(measurements[..., :lanes]))
 
     def _draw(self, span: slice) -> Scans:
@@ -337,18 +370,37 @@ class BlockSimulation:
         model = truth_model(truth, self._step_s[span])
         steps, n_x = span.stop - span.start, len(self.state_names)
         uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
-        chain = _chain(truth, model)
-        supermodes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
-        before = chain.mode[self._supermode]
-        cumulative = np.cumsum(chain.transition_matrix, axis=-1)
-        _draw_modes(self._supermode, uniform, cumulative, supermodes)
-        modes = chain.mode[supermodes]
+        before, modes = _advance_modes(_chain(truth, model), self._supermode, uniform)
         noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, n_x, BLOCK_RUNS))
         state = np.empty((steps, n_x, BLOCK_RUNS))
         root = np.ascontiguousarray(square_root(model.process_noise_covariance))
         arguments: tuple[Any, ...] = (model.state_transition, model.input_effect, root, state)
         _drive(self._state, modes, noise, *arguments)
-        return TruthSpan(state, modes, self._chain_since_switch(span, before, modes))
+        since_switch_s = self._chain_since_switch(span, before, modes)
+        if self._last_switch is None:
+            return TruthSpan(state, modes, since_switch_s)
+        step = np.arange(span.start, span.stop)[:, np.newaxis] + 1
+        final = (step >= self._last_switch).astype(np.float64)
+        return TruthSpan(state, modes, since_switch_s, final)
+
+    def _last_switches(self) -> Array:
+        """The step of each run's last switch of mode (BLOCK_RUNS,); 0: none; inf: after the end.
+
+        The modes are drawn once for this and once more when their time comes. What the chain does
+        after the last step is drawn too, so that its end is no switch's end.
+        """
+        truth = self._case.truth
+        assert isinstance(truth, ChainTruth)
+        draws = stream(*self._key, Purpose.MODE_SEQUENCE)
+        draws.random(BLOCK_RUNS)  # of the start
+        supermode, last = self._supermode.copy(), np.zeros(BLOCK_RUNS)
+        for span in spans(len(self._step_s), FORESEEN_STEPS):
+            chain = _chain(truth, truth_model(truth, self._step_s[span]))
+            uniform = draws.random((span.stop - span.start, BLOCK_RUNS))
+            before, modes = _advance_modes(chain, supermode, uniform)
+            _note_switches(before, modes, span.start, last)
+        last[draws.random(BLOCK_RUNS) >= chain.final_probability[-1, supermode]] = np.inf
+        return last
 
     def _chain_since_switch(self, span: slice, before: Modes, modes: Modes) -> Array:
         times_s = self._case.times_s
@@ -367,6 +419,14 @@ def _since_switch(times_s: Array, modes: Modes) -> Array:
     switched = np.flatnonzero(modes[2:] != modes[1:-1]) + 2
     began[switched] = times_s[switched - 1]
     return times_s - np.maximum.accumulate(began)
+
+
+def _final(modes: Modes) -> Array:
+    """1 where the mode stays as it is to the end of the flight, else 0; modes (n_steps + 1,)."""
+    switches = np.flatnonzero(modes[2:] != modes[1:-1]) + 2
+    final = np.zeros(len(modes))
+    final[switches[-1] if switches.size else 0 :] = 1.0
+    return final
 
 
 def truth_model(truth: ChainTruth, step_s: Array) -> JumpMarkovModel:

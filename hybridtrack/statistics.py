@@ -58,10 +58,23 @@ METRICS: Mapping[str, Metric] = {
         "greater",
         "share of steps whose true mode leads by as much as under `compare_with`, or more",
     ),
+    "final_mode_brier": Metric(
+        "final_mode_brier",
+        False,
+        "less",
+        "squared error of the probability that the mode now is the last one",
+    ),
+    "final_mode_prior_brier": Metric(
+        "final_mode_prior_brier",
+        False,
+        "less",
+        "the same of the chain's own probability, which knows the time and no scan",
+    ),
 }
 
 # The position error at the scans that were not missed: what compares with the measurements.
 POSITION, POSITION_AT_SCANS = "position_squared_error_m2", "position_squared_error_at_scans_m2"
+VELOCITY = "velocity_squared_error_m2_s2"
 QUANTITIES = (*dict.fromkeys(metric.quantity for metric in METRICS.values()), POSITION_AT_SCANS)
 
 
@@ -165,6 +178,50 @@ def ratio_of_sums(cases: Sequence[tuple[float, ...]], root: bool) -> Estimate:
     return Estimate(value, error / (2 * value) if value > 0 else 0.0, runs)
 
 
+class Reliability(NamedTuple):
+    """Probabilities held against what came of them, bin by bin; arrays (bins,), NaN where empty."""
+
+    share: Array  # of all steps
+    probability: Array  # mean of those given
+    frequency: Array  # how often the event came
+    standard_error: Array  # of the frequency, over runs
+    calibration_error: Estimate  # mean distance of the two, weighed by the share (ECE)
+
+
+def reliability(cases: Sequence["VectorMoments"]) -> Reliability:
+    """From each case's moments of a run's sums by bins: numbers, probabilities, events (3 bins,).
+
+    The expected calibration error is that of Naeini, Cooper, Hauskrecht 2015. Noise makes it a
+    little too large: an honest bin is off by its own standard error. Errors by the delta method
+    over runs; cases are strata.
+    """
+    n = sum(float(case.n) for case in cases)
+    total = np.sum([case.n * case.mean for case in cases], axis=0)
+    # A sum over n runs varies n times as much as one run does.
+    variance = np.sum([c.n * c.products / np.maximum(c.n - 1.0, 1.0) for c in cases], axis=0)
+    number, probability, events = total.reshape(3, -1)
+    bins, steps = number.size, float(number.sum())
+    if steps == 0:
+        nothing = np.full(bins, np.nan)
+        return Reliability(nothing, nothing, nothing, nothing, NOTHING)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        frequency = events / number
+        spread = variance.reshape(3, bins, 3, bins)
+        i = np.arange(bins)
+        of_bin = spread[2, i, 2, i] - 2 * frequency * spread[0, i, 2, i]
+        of_bin += frequency**2 * spread[0, i, 0, i]
+        error = np.sqrt(np.maximum(of_bin, 0.0)) / number
+        mean = probability / number
+    gap = probability - events
+    value = float(np.abs(gap).sum()) / steps
+    slope = np.concatenate([np.full(bins, -value), np.sign(gap), -np.sign(gap)]) / steps
+    calibration = math.sqrt(max(float(slope @ variance @ slope), 0.0))
+    if n < 2:
+        error, calibration = np.full(bins, np.nan), math.nan
+    estimate = Estimate(value, calibration, round(n))
+    return Reliability(number / steps, mean, frequency, error, estimate)
+
+
 class RunSums(NamedTuple):
     """One estimator's sums in one window, run by run, in one order for all; leading axes free."""
 
@@ -182,41 +239,47 @@ class Paired(NamedTuple):
     ratio: Estimate  # first / second
 
 
-class PairMoments(NamedTuple):
-    """Moments over one case's runs of (S1, N1, S1 - S2, N1 - N2): sums and numbers of steps of two.
-
-    The differences stand for the second estimator, so that two alike have an error of exactly 0.
-    """
+class VectorMoments(NamedTuple):
+    """Moments over one case's runs of vectors, a vector a run."""
 
     n: Array  # (...)
-    mean: Array  # (..., 4)
-    products: Array  # (..., 4, 4) sums of products of deviations
+    mean: Array  # (..., size)
+    products: Array  # (..., size, size) sums of products of deviations
 
 
-def pair_moments(first: RunSums, second: RunSums) -> PairMoments:
-    """Moments of a pair; a run that diverged under either is left out of both."""
+def pair_moments(first: RunSums, second: RunSums) -> VectorMoments:
+    """Moments of (S1, N1, S1 - S2, N1 - N2): sums and numbers of steps of two.
+
+    A run that diverged under either is left out of both. The differences stand for the second
+    estimator, so that two alike have an error of exactly 0.
+    """
     both = first.sound & second.sound & (first.numbers > 0) & (second.numbers > 0)
-    counted = both[..., np.newaxis, :]
     s, m = first.sums, first.numbers
     with np.errstate(invalid="ignore"):  # of runs that are left out
         values = np.stack([s, m, s - second.sums, m - second.numbers], axis=-2)
-    n = both.sum(axis=-1).astype(np.float64)
+    return vector_moments(values, both)
+
+
+def vector_moments(values: Array, counted: NDArray[np.bool_]) -> VectorMoments:
+    """Moments of values (..., size, n_runs) over the runs that are counted (..., n_runs)."""
+    n = counted.sum(axis=-1).astype(np.float64)
+    counted = counted[..., np.newaxis, :]
     mean = np.where(counted, values, 0.0).sum(axis=-1) / np.maximum(n, 1.0)[..., np.newaxis]
     deviations = np.where(counted, values - mean[..., np.newaxis], 0.0)
-    return PairMoments(n, mean, deviations @ np.swapaxes(deviations, -1, -2))
+    return VectorMoments(n, mean, deviations @ np.swapaxes(deviations, -1, -2))
 
 
-def merge_pairs(a: PairMoments, b: PairMoments) -> PairMoments:
+def merge_vectors(a: VectorMoments, b: VectorMoments) -> VectorMoments:
     """Both together (Chan's merging)."""
     n = a.n + b.n
     share = np.divide(b.n, n, out=np.zeros_like(n), where=n > 0)[..., np.newaxis]
     step = b.mean - a.mean
     outer = step[..., :, np.newaxis] * step[..., np.newaxis, :]
     weight = (a.n[..., np.newaxis] * share)[..., np.newaxis]
-    return PairMoments(n, a.mean + share * step, a.products + b.products + weight * outer)
+    return VectorMoments(n, a.mean + share * step, a.products + b.products + weight * outer)
 
 
-def compare(cases: Sequence[PairMoments], root: bool) -> Paired:
+def compare(cases: Sequence[VectorMoments], root: bool) -> Paired:
     """Difference and ratio of a metric over the same runs, with paired standard errors.
 
     From each case's moments of one pair, without leading axes. By the delta method; cases are

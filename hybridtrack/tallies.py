@@ -16,6 +16,10 @@ from hybridtrack.estimators import Estimates
 from hybridtrack.models import Array
 from hybridtrack.scoring import (
     KEPT,
+    NOTHING_MORE,
+    POSITION_ROW,
+    VELOCITY_ROW,
+    Given,
     Layout,
     Names,
     Sheet,
@@ -25,10 +29,14 @@ from hybridtrack.scoring import (
     layout,
     leave_out_missed,
     some_missed,
+    subtract,
 )
 from hybridtrack.simulation import Scans
-from hybridtrack.statistics import POSITION_AT_SCANS, Moments
+from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, VELOCITY, Moments
 from hybridtrack.vectors import aligned_zeros
+
+BINS = 10  # of probabilities from 0 to 1, to hold them against frequencies
+DIFFERENCE = ":difference"  # of a quantity from the leading estimator's, run by run
 
 
 class Totals(NamedTuple):
@@ -40,6 +48,9 @@ class Totals(NamedTuple):
     sums: Array  # (n_tallied, n_windows, lanes)
     numbers: Array  # (n_tallied, n_windows, lanes) steps counted run by run
     common: Array  # (n_tallied, n_windows) steps counted for all runs at once
+    # (3, BINS or 0, lanes) by the probability that the mode now is the last one: the number of
+    # steps, the sum of those probabilities, and how often it was the last one
+    final_bins: Array
 
 
 @row_kernel
@@ -98,6 +109,18 @@ def add_to_windows(row, finite, held, sums, numbers, common):
                 numbers[w, b] += 1.0 if present else 0.0
 
 
+@row_kernel
+def add_to_bins(bins, probability, final, held):
+    """Add a step's probabilities, and what came of them; held and final (lanes,) or (1,)."""
+    for b in range(probability.size):
+        p = probability[b]
+        if held[b if held.size > 1 else 0] and p == p:
+            i = min(int(p * BINS), BINS - 1)
+            bins[0, i, b] += 1.0
+            bins[1, i, b] += p
+            bins[2, i, b] += final[b if final.size > 1 else 0]
+
+
 @lane_kernel
 def tally(totals, sheet, layout, step, runs, scans, held, estimates):
     """Score a span that begins at `step` and add it to the totals."""
@@ -124,6 +147,21 @@ def tally(totals, sheet, layout, step, runs, scans, held, estimates):
                     leave_out_missed(likelihood, measurement)
                 add_to_step(likelihood, runs, totals, i, step + k)
                 i += 1
+        if layout.paired:
+            if layout.position.shape[0]:
+                subtract(sheet.scratch[0], sheet.rows[POSITION_ROW], sheet.leading_position[k])
+                add_to_step(sheet.scratch[0], runs, totals, i, step + k)
+                i += 1
+            if layout.velocity.shape[0]:
+                subtract(sheet.scratch[0], sheet.rows[VELOCITY_ROW], sheet.leading_velocity[k])
+                add_to_step(sheet.scratch[0], runs, totals, i, step + k)
+                i += 1
+        if layout.final:
+            probability = estimates.final_mode_probability[k]
+            add_to_step(probability, runs, totals, i, step + k)
+            totals.n[i + 1, step + k] = runs
+            totals.mean[i + 1, step + k] = estimates.final_mode_prior[k, 0]
+            add_to_bins(totals.final_bins, probability, scans.truth.final[k], held[k, 0])
 
 
 class Plan(NamedTuple):
@@ -135,13 +173,17 @@ class Plan(NamedTuple):
 
 
 @functools.lru_cache
-def plan(names: Names, *, likelihoods: bool, leads: bool, compared: bool) -> Plan:
-    """Blocks have it in common; the arguments are a tally's."""
-    compared = leads or compared
-    quantities = defined(names, likelihoods=likelihoods, compared=compared)
-    kinds = ("mode_probability", "mode_likelihood") if likelihoods else ("mode_probability",)
-    series = (f"{kind}:{mode}" for mode in names.scored_modes for kind in kinds)
-    kernels = layout(names, likelihoods=likelihoods, leads=leads, compared=compared)
+def plan(names: Names, given: Given) -> Plan:
+    """Blocks have it in common."""
+    quantities, kernels = defined(names, given), layout(names, given)
+    kinds = ("mode_probability", "mode_likelihood") if given.likelihoods else ("mode_probability",)
+    series = [f"{kind}:{mode}" for mode in names.scored_modes for kind in kinds]
+    if given.paired:
+        series += [
+            quantity + DIFFERENCE for quantity in (POSITION, VELOCITY) if quantity in quantities
+        ]
+    if kernels.final:
+        series += ["final_mode_probability", "final_mode_prior"]
     return Plan(quantities, (*quantities, *series), kernels)
 
 
@@ -155,17 +197,10 @@ class Tally:
         windows: tuple[str, ...],
         sheet: Sheet,
         runs: int,
-        *,
-        likelihoods: bool = False,
-        leads: bool = False,
-        compared: bool = False,
+        given: Given = NOTHING_MORE,
     ) -> None:
-        """The sheet may be shared; runs: how many of its lanes count.
-
-        likelihoods: the estimates hold them; leads: `compare_with` names this estimator, which
-        then is tallied before the others; compared: this one or a leading one has an advantage.
-        """
-        self._plan = plan(names, likelihoods=likelihoods, leads=leads, compared=compared)
+        """The sheet may be shared; runs: how many of its lanes count."""
+        self._plan = plan(names, given)
         self._windows = windows
         self._sheet = sheet
         self._runs = runs
@@ -180,6 +215,7 @@ class Tally:
             sums=aligned_zeros(*cells, lanes),
             numbers=aligned_zeros(*cells, lanes),
             common=np.zeros(cells),
+            final_bins=aligned_zeros(3, BINS if self._plan.layout.final else 0, lanes),
         )
 
     def add(self, step: int, scans: Scans, held: NDArray[np.bool_], estimates: Estimates) -> None:
@@ -201,3 +237,10 @@ class Tally:
         for quantity, *by_window in zip(self._plan.quantities, *both, strict=True):
             for window, *totals in zip(self._windows, *by_window, strict=True):
                 yield (window, quantity), (totals[0], totals[1])
+
+    @property
+    def final_bins(self) -> Array:
+        """Each run's sums by bins (3 * BINS, runs), see Totals; no rows where there are none."""
+        return self._totals.final_bins.reshape(-1, self._totals.final_bins.shape[-1])[
+            :, : self._runs
+        ]

@@ -18,8 +18,8 @@ from hybridtrack.statistics import (
     SumMoments,
     compare,
     merge_moments,
-    merge_pairs,
     merge_sum_moments,
+    merge_vectors,
     pair_moments,
     ratio_of_sums,
     sum_moments,
@@ -393,7 +393,7 @@ def test_pairs_merge_along_all_their_axes():
         pair_moments(part(one, which), part(two, which))
         for which in (slice(0, 50), slice(50, 90), slice(0, 0))
     ]
-    merged = functools.reduce(merge_pairs, parts)
+    merged = functools.reduce(merge_vectors, parts)
     whole = pair_moments(part(one, slice(None)), part(two, slice(None)))
     assert merged.n.tolist() == whole.n.tolist() == [90, 90, 0]
     for ours, expected in zip(merged, whole, strict=True):

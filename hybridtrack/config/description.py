@@ -61,3 +61,9 @@ class Experiment(NamedTuple):
     keep_tracks: int
     claims: tuple[Claim, ...]
     resolved: dict[str, Any]  # the scenario as it can be run again
+
+    @property
+    def foresees(self) -> bool:
+        """Whether an estimator tells how likely the mode now is the last, and the truth knows."""
+        tell = any(chosen.estimator.tells_final_mode(chosen.settings) for chosen in self.estimators)
+        return tell and bool(self.truth_modes)

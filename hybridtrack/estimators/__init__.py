@@ -77,6 +77,10 @@ class Estimator(Protocol):
         """Whether it has to be given the true modes."""
         ...
 
+    def tells_final_mode(self, settings: Any) -> bool:
+        """Whether it estimates how likely the mode now is the last one."""
+        ...
+
     def prepare(self, settings: Any, model: JumpMarkovModel) -> Any:
         """What it makes of a bank's model for some steps; kept for all blocks with such steps."""
         ...
@@ -96,10 +100,15 @@ class BankEstimator(NamedTuple):
     model: Callable[[JumpMarkovModel, Any], JumpMarkovModel]
     recursion: Callable[[Any], Recursion]
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
+    is_bounded: bool = False  # whether its chain comes to an end, and the model says how likely
 
     def is_told_modes(self, settings: Any) -> bool:
         """Whether it has to be given the true modes."""
         return self.recursion(settings).interaction == _bank.INHERIT
+
+    def tells_final_mode(self, settings: Any) -> bool:
+        """Whether it estimates how likely the mode now is the last one."""
+        return self.is_bounded
 
     def prepare(self, settings: Any, model: JumpMarkovModel) -> "Prepared":
         """The model on its own chain, as it is and as the kernel wants it."""

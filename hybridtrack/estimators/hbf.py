@@ -38,4 +38,5 @@ ESTIMATOR = BankEstimator(
     model=_model,
     recursion=_recursion,
     limits={"most_transitions": (0.0, 100.0)},
+    is_bounded=True,
 )

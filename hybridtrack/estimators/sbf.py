@@ -39,4 +39,5 @@ ESTIMATOR = BankEstimator(
     model=_model,
     recursion=_recursion,
     limits={"continuation_probability": (0.0, 1.0), "leak": (0.0, 1.0)},
+    is_bounded=True,
 )
