@@ -5,6 +5,7 @@ transitions there have been (hard bound). Row = from, and the supermode at k dri
 k - 1 to k. Both chains stand here because truths and filters move on them.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -116,6 +117,37 @@ def _never_left(transition_matrix: Array) -> Array:
     """1 for a mode that stays for ever, 0 for one that is left some time (n_times, n)."""
     stays = np.diagonal(transition_matrix, axis1=1, axis2=2)
     return np.where(stays == 1.0, 1.0, 0.0)
+
+
+def expected_steps_to_end(continuation_probability: float) -> float:
+    """Steps until the transition that ends a soft bound, 1/(1 - p0) (Sigalov 2011, section IV)."""
+    ending = 1.0 - continuation_probability
+    return 1.0 / ending if ending else math.inf
+
+
+def expected_steps_in_mode(transition_matrix: Array) -> Array:
+    """Steps from entering a mode to leaving it, 1/(1 - p_ii); transition_matrix (n, n)."""
+    leaving = 1.0 - np.diagonal(transition_matrix)
+    return np.divide(1.0, leaving, out=np.full_like(leaving, np.inf), where=leaving > 0.0)
+
+
+def expected_transitions(supermodes: Supermodes) -> float:
+    """How often the mode changes on average, for ever; steps of one length.
+
+    From the expected visits of the supermodes that are not yet the last, (I - T')^-1 of the start.
+    """
+    chain = pruned(supermodes)
+    matrix, mode = chain.transition_matrix[0], chain.mode
+    passing = np.flatnonzero(chain.final_probability[0] < 1.0)
+    among = matrix[np.ix_(passing, passing)]
+    if passing.size == 0:
+        return 0.0
+    if np.abs(np.linalg.eigvals(among)).max() >= 1.0 - 1e-12:  # never done
+        return math.inf
+    start = chain.initial_probabilities[passing]
+    visits = np.linalg.solve(np.eye(passing.size) - among.T, start)
+    changes = np.where(mode[passing, np.newaxis] != mode, matrix[passing], 0.0).sum(axis=1)
+    return float(visits @ changes)
 
 
 def pruned(supermodes: Supermodes) -> Supermodes:

@@ -69,6 +69,7 @@ SCHEMAS = {
             ("metric", pa.string()),
             ("window", pa.string()),
             ("published", pa.float64()),
+            ("tolerance", pa.float64()),
             ("sign", pa.string()),
             ("ours", pa.float64()),
             ("standard_error", pa.float64()),

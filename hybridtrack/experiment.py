@@ -247,6 +247,7 @@ def _manifest(experiment: Experiment) -> dict[str, Any]:
         "modes": list(experiment.bank.names),
         "windows": [window.name for window in experiment.windows],
         "compare_with": experiment.compare_with,
+        "error": experiment.error,
         "cases": len(experiment.cases),
         "versions": {
             "hybridtrack": __version__,

@@ -246,6 +246,32 @@ def wiener_acceleration(
     return _motion(transition, noise, dimensions)
 
 
+@motion_model(
+    axis_states=("position", "velocity", "acceleration"),
+    source="Sigalov, Oshman 2011, eq. 16 as printed",
+)
+def wiener_acceleration_as_printed(
+    step_s: FloatArray, dimensions: int, *, acceleration_std_m_s2: float
+) -> Motion:
+    """Wiener acceleration with T where `wiener_acceleration` has 1, as Sigalov 2011 prints it.
+
+    Q = G G' std², G = [T²/2, T, 1], but for its last entry, which is T std². To repeat the paper;
+    units do not fit. step_s is (n,), in s. Raises UserError for steps below 1 s, where this Q is
+    no covariance.
+    """
+    shortest = float(np.min(step_s))
+    if shortest < 1.0:
+        raise UserError(
+            f"Q as printed is no covariance for steps below 1 s, and one lasts {shortest:g} s; use "
+            "wiener_acceleration."
+        )
+    motion = wiener_acceleration(step_s, dimensions, acceleration_std_m_s2=acceleration_std_m_s2)
+    noise = motion.process_noise_covariance
+    last = np.arange(2, noise.shape[-1], 3)
+    noise[:, last, last] *= step_s[:, np.newaxis]
+    return motion
+
+
 def white_acceleration_covariance(
     step_s: FloatArray, names: tuple[str, ...], acceleration_std_m_s2: float
 ) -> FloatArray:

@@ -31,8 +31,8 @@ from hybridtrack.statistics import (
     ratio_of_sums,
     reliability,
 )
-from hybridtrack.tallies import DIFFERENCE
-from hybridtrack.verdicts import Claim, Outcome, judge_comparison, judge_figure
+from hybridtrack.tallies import BINS, DIFFERENCE
+from hybridtrack.verdicts import Claim, Outcome, judge_comparison, judge_exact, judge_figure
 
 
 def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
@@ -191,13 +191,11 @@ def _reliabilities(experiment: Experiment, cases: list[GroupStatistics]) -> dict
 
 
 def reliability_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str, Any]:
-    rows = []
-    for label, found in _reliabilities(experiment, cases).items():
-        bins = found.share.size
-        for i in range(bins):
-            rows.append(
-                (label, i / bins, (i + 1) / bins, *(float(array[i]) for array in found[:4]))
-            )
+    rows = [
+        (label, i / BINS, (i + 1) / BINS, *(float(array[i]) for array in found[:4]))
+        for label, found in _reliabilities(experiment, cases).items()
+        for i in range(BINS)
+    ]
     return _columns("reliability", rows)
 
 
@@ -304,6 +302,7 @@ def published_rows(
                 claim.metric,
                 claim.window,
                 claim.value,
+                claim.tolerance if claim.value is not None else None,
                 claim.sign,
                 ours.value,
                 ours.standard_error,
@@ -319,6 +318,8 @@ def published_rows(
 def _judge(
     experiment: Experiment, pairs: Pairs, cases: list[GroupStatistics], claim: Claim
 ) -> Outcome:
+    if claim.exact is not None:
+        return judge_exact(claim)
     assumed = bool(experiment.assumptions)
     if claim.compare is not None:
         pair = pairs.compare((*claim.compare, claim.window), claim.metric)

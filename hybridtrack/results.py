@@ -45,6 +45,7 @@ FINISHED: dict[str, type | tuple[type, ...]] = {  # what a finished run's manife
     "modes": list,
     "windows": list,
     "compare_with": (str, type(None)),
+    "error": str,
     "diverged": dict,
 }
 DAMAGE = (

@@ -14,12 +14,17 @@ from rich.text import Text
 from hybridtrack import results
 
 # Metric, heading: what the main table shows, where the scenario has it.
-COLUMNS = (
-    ("position_rmse_m", "position\nRMS, m"),
-    ("velocity_rmse_m_s", "velocity\nRMS, m/s"),
-    ("mode_accuracy", "mode\naccuracy"),
-    ("mode_brier", "Brier\nscore"),
-)
+ERRORS = {
+    "rmse": (
+        ("position_rmse_m", "position\nRMS, m"),
+        ("velocity_rmse_m_s", "velocity\nRMS, m/s"),
+    ),
+    "mse": (
+        ("position_mse_m2", "position\nMSE, m²"),
+        ("velocity_mse_m2_s2", "velocity\nMSE, m²/s²"),
+    ),
+}
+MODES = (("mode_accuracy", "mode\naccuracy"), ("mode_brier", "Brier\nscore"))
 MOST_DECIMALS = 6  # more than that, and figures of a million on, take an exponent
 MOST_DIGITS = 6  # of a figure with an exponent, after its point
 SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
@@ -77,11 +82,12 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     runs, cases = manifest["runs"], manifest["cases"]
     over = f" in each of {cases} cases" if cases > 1 else ""
     yield Text(f"{manifest['title']}: {counted(runs, 'run')}{over}, seed {manifest['seed']}\n")
-    yield _summary(summary, manifest["estimators"])
+    shown = (*ERRORS[manifest["error"]], *MODES)
+    yield _summary(summary, manifest["estimators"], shown)
     comparisons = results.read_rows(path, "comparisons")
     if comparisons:
         yield ""
-        yield _ratios(comparisons, manifest["compare_with"])
+        yield _ratios(comparisons, manifest["compare_with"], shown)
     for label, count in manifest.get("diverged", {}).items():
         yield Text(
             f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
@@ -111,27 +117,33 @@ def _plain_table() -> Table:
     return Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1), show_edge=False)
 
 
-def _summary(summary: Rows, estimators: list[str]) -> Table:
+Columns = tuple[tuple[str, str], ...]  # metrics and their headings
+
+
+def _summary(summary: Rows, estimators: list[str], shown: Columns) -> Table:
     figures = {
         (row["estimator"], row["metric"]): figure(row["value"], row["standard_error"])
         for row in summary
         if row["window"] == "all"
     }
-    return _by_metric("estimator", ["raw", *estimators], figures)
+    return _by_metric("estimator", ["raw", *estimators], figures, shown)
 
 
-def _ratios(comparisons: Rows, reference: str) -> Table:
+def _ratios(comparisons: Rows, reference: str, shown: Columns) -> Table:
     figures = {
         (row["first"], row["metric"]): figure(row["ratio"], row["ratio_standard_error"])
         for row in comparisons
         if row["window"] == "all"
     }
-    return _by_metric(f"ratio to {reference}", list(dict.fromkeys(k[0] for k in figures)), figures)
+    firsts = list(dict.fromkeys(key[0] for key in figures))
+    return _by_metric(f"ratio to {reference}", firsts, figures, shown)
 
 
-def _by_metric(heading: str, labels: list[str], figures: dict[tuple[str, str], str]) -> Table:
+def _by_metric(
+    heading: str, labels: list[str], figures: dict[tuple[str, str], str], shown: Columns
+) -> Table:
     """A row per estimator, a column per metric that there is."""
-    metrics = [(m, h) for m, h in COLUMNS if any(key[1] == m for key in figures)]
+    metrics = [(m, h) for m, h in shown if any(key[1] == m for key in figures)]
     table = _plain_table()
     table.add_column(Text(heading), overflow="fold")
     for _, text in metrics:
@@ -159,9 +171,13 @@ def _published(published: Rows) -> Table:
 
 
 def claimed(row: Mapping[Any, Any]) -> str:
-    """What was published: a figure, or the sign of a difference."""
+    """What was published: a figure, the sign of a difference, or that two are equal."""
+    if row["sign"] == "equal":
+        return f"ratio {row['published']:g}±{row['tolerance']:g}"
     if row["published"] is None:
         return "Δ < 0" if row["sign"] == "less" else "Δ > 0"
+    if row["sign"] and " / " not in row["estimator"]:
+        return f"{'<' if row['sign'] == 'less' else '>'} {row['published']:g}"
     return f"{row['published']:g}"
 
 

@@ -1,9 +1,11 @@
 """What became of a published claim: the one place where a verdict is reached.
 
 A claim is a figure ("IMM position RMS is 18 m") or a comparison ("RMIMM has the smaller RMS"), on
-a metric of a run. A figure is met if ours, give or take K standard errors, lies within what the
-printed digits can mean; a comparison holds if the paired difference has the claimed sign by more
-than K standard errors. Agreement within an error wider than the printed digits decides nothing.
+a metric of a run; or a figure that follows from the scenario alone ("50 steps on average"). A
+figure is met if ours, give or take K standard errors, lies within what the printed digits can mean;
+a comparison holds if the paired difference has the claimed sign by more than K standard errors, or
+if the paired ratio of two that are said to be equal is 1 within the scenario's tolerance. Agreement
+within an error wider than the printed digits decides nothing.
 The error is itself estimated from the runs: where these are few, Student's quantile of the same
 probability stands for K, and one run decides nothing. A window that holds no step, or no run that
 didn't diverge, leaves nothing to judge.
@@ -35,15 +37,16 @@ class Claim(NamedTuple):
     """A published claim as the scenario states it."""
 
     claim: str
-    estimator: str | None  # of a figure
+    estimator: str | None  # of a figure of a run
     compare: tuple[str, str] | None  # of a comparison: first, second
-    metric: str
+    metric: str  # or the name of an exact figure
     window: str
     value: float | None  # the figure, or the published ratio first/second of a comparison
-    tolerance: float  # half a unit of the last printed digit of `value`
-    sign: str | None  # less | greater: first against second
+    tolerance: float  # half a unit of the last printed digit of `value`, or as the scenario says
+    sign: str | None  # less | greater | equal: first against second; a figure against `value`
     expect: str  # the verdict when last looked at
     because: str
+    exact: float | None = None  # what follows from the scenario alone
 
 
 class Outcome(NamedTuple):
@@ -64,26 +67,49 @@ def printed_tolerance(text: str) -> float:
 
 
 def judge_figure(claim: Claim, ours: Estimate, assumptions: bool) -> Outcome:
-    """The verdict on a published figure; `assumptions`: the scenario filled in what is missing."""
+    """The verdict on a published figure, or bound where there is a sign.
+
+    assumptions: the scenario filled in what is missing.
+    """
+    if claim.sign is not None:
+        assert claim.value is not None
+        distance = Estimate(ours.value - claim.value, ours.standard_error, ours.n_runs)
+        return _outcome(claim, ours, _sign(claim, distance))
     return _outcome(claim, ours, _figure(claim, ours, assumptions))
 
 
+def judge_exact(claim: Claim) -> Outcome:
+    """The verdict on a figure that needs no run: no chance, no assumption."""
+    assert claim.exact is not None
+    ours = Estimate(claim.exact, math.nan, 0)
+    assert claim.value is not None
+    met = abs(claim.exact - claim.value) <= claim.tolerance
+    return _outcome(claim, ours, REPRODUCED if met else NOT_REPRODUCED)
+
+
 def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
-    """The verdict on a comparison; a published ratio is judged too, where there is one."""
+    """The verdict on a comparison; a published ratio is judged too, where there is one.
+
+    Two that are said to be equal are so if their ratio is 1 within the scenario's tolerance.
+    """
     assert claim.sign is not None
-    gap = ours.difference.value if claim.sign == "greater" else -ours.difference.value
-    allowed = _allowed(ours.difference)
+    if claim.sign == "equal":
+        return _outcome(claim, ours.ratio, _figure(claim, ours.ratio, assumptions))
     figure = ours.ratio if claim.value is not None else ours.difference
-    if gap > allowed:
-        verdict = REPRODUCED
-        if claim.value is not None:
-            met = _figure(claim, ours.ratio, assumptions)
-            verdict = DIRECTION if met == NOT_REPRODUCED else met
-    elif gap < -allowed:
-        verdict = NOT_REPRODUCED
-    else:
-        verdict = _undecided(ours.difference)
+    verdict = _sign(claim, ours.difference)
+    if verdict == REPRODUCED and claim.value is not None:
+        met = _figure(claim, ours.ratio, assumptions)
+        verdict = DIRECTION if met == NOT_REPRODUCED else met
     return _outcome(claim, figure, verdict)
+
+
+def _sign(claim: Claim, difference: Estimate) -> str:
+    """Whether a difference has the claimed sign by more than chance may do."""
+    gap = difference.value if claim.sign == "greater" else -difference.value
+    allowed = _allowed(difference)
+    if gap > allowed:
+        return REPRODUCED
+    return NOT_REPRODUCED if gap < -allowed else _undecided(difference)
 
 
 def _figure(claim: Claim, ours: Estimate, assumptions: bool) -> str:

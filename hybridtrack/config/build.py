@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from hybridtrack.config import banks, checks, starts, truths
+from hybridtrack.config.claims import built_claim
 from hybridtrack.config.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.config.reader import Document, Keys, ScenarioError
-from hybridtrack.config.schema import ClaimForm, Form, ScenarioForm, WindowForm
+from hybridtrack.config.schema import Form, ScenarioForm, WindowForm
 from hybridtrack.errors import UserError
 from hybridtrack.estimators import estimators
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.simulation import Case, FixedTruth
-from hybridtrack.statistics import METRICS
-from hybridtrack.verdicts import Claim, printed_tolerance
+from hybridtrack.verdicts import Claim
 
 
 def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
@@ -49,7 +49,10 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
     for name, window in form.windows.items():
         windows.append(_window(name, window, form, truth_modes, document))
         _check_span(name, window, cases, document)
-    claims = tuple(_claim(i, form, chosen, document) for i in range(len(form.published)))
+    sensor = truths.sensor(form, truth_modes, initial.two_point, document)
+    claims = tuple(
+        built_claim(i, form, chosen, cases, sensor, document) for i in range(len(form.published))
+    )
     return Experiment(
         name=form.name,
         title=form.title or form.name,
@@ -58,10 +61,11 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         cases=cases,
         truth_modes=truth_modes,
         bank=bank,
-        sensor=truths.sensor(form, truth_modes, initial.two_point, document),
+        sensor=sensor,
         initial=initial,
         estimators=chosen,
         compare_with=form.compare_with,
+        error=form.scoring.error,
         windows=tuple(windows),
         runs=form.monte_carlo.runs,
         seed=form.monte_carlo.seed,
@@ -202,74 +206,6 @@ def _check_span(name: str, window: WindowForm, cases: tuple[Case, ...], document
         raise document.error(
             path, f"window '{name}' holds no scan: they last from {first:g} to {last:g} s; move it"
         )
-
-
-def _check_metric(
-    label: str, metric: str, chosen: tuple[ChosenEstimator, ...], document: Document, path: Keys
-) -> None:
-    """A metric that the estimator has: raw measurements are positions, one mode needs no guess."""
-    one_mode = {c.label for c in chosen if len(c.bank.modes) == 1}
-    known = ("position_", "velocity_") if label in one_mode else ("",)
-    if label == "raw":
-        known = ("position_",)
-    if not metric.startswith(known):
-        there = ", ".join(name for name in METRICS if name.startswith(known))
-        raise document.error(
-            (*path, "metric"), f"'metric' is {metric}, which {label} doesn't have; it has {there}"
-        )
-
-
-def _claim(
-    i: int, form: ScenarioForm, chosen: tuple[ChosenEstimator, ...], document: Document
-) -> Claim:
-    claim: ClaimForm = form.published[i]
-    path: Keys = ("published", i)
-    labels = ("raw", *form.estimators)
-    if (claim.estimator is None) == (claim.compare is None):
-        raise document.error(path, "a claim needs 'estimator' or 'compare', and not both")
-    for key, names in (("estimator", [claim.estimator]), ("compare", claim.compare or [])):
-        for label in names:
-            if label is not None and label not in labels:
-                raise document.error(
-                    (*path, key),
-                    f"'{label}' is no estimator here; {checks.nearest(label, labels)}",
-                )
-            if label is not None:
-                _check_metric(label, claim.metric, chosen, document, path)
-    if claim.estimator is not None and claim.value is None:
-        raise document.error(path, "'value' is missing in this claim on one estimator; add it")
-    if claim.estimator is not None and claim.sign is not None:
-        raise document.error((*path, "sign"), "'sign' belongs to a claim with 'compare'; remove it")
-    if claim.compare is not None and claim.compare[0] == claim.compare[1]:
-        raise document.error(
-            (*path, "compare"), f"'compare' names {claim.compare[0]} twice; name two estimators"
-        )
-    if claim.compare is not None and claim.sign is None:
-        raise document.error(path, "'sign' is missing in this comparison; add less or greater")
-    if claim.window != "all" and claim.window not in form.windows:
-        raise document.error(
-            (*path, "window"),
-            f"window '{claim.window}' is not defined; "
-            f"{checks.nearest(claim.window, ('all', *form.windows))}",
-        )
-    tolerance = claim.tolerance
-    if tolerance is None and claim.value is not None:
-        try:
-            tolerance = printed_tolerance(document.source_text((*path, "value")) or "")
-        except (ValueError, OverflowError):  # not in plain decimals
-            tolerance = printed_tolerance(f"{claim.value:.15g}")
-    return Claim(
-        claim=claim.claim,
-        estimator=claim.estimator,
-        compare=None if claim.compare is None else (claim.compare[0], claim.compare[1]),
-        metric=claim.metric,
-        window=claim.window,
-        value=claim.value,
-        tolerance=tolerance or 0.0,
-        sign=claim.sign,
-        expect=claim.expect,
-        because=claim.because,
-    )
 
 
 def _resolved(form: Form, claims: tuple[Claim, ...], folder: Path) -> dict[str, Any]:

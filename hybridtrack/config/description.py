@@ -55,6 +55,7 @@ class Experiment(NamedTuple):
     initial: Initial
     estimators: tuple[ChosenEstimator, ...]
     compare_with: str | None
+    error: str  # rmse | mse: what tables and figures show
     windows: tuple[Window, ...]
     runs: int
     seed: int

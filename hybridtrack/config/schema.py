@@ -24,6 +24,10 @@ from hybridtrack.statistics import METRICS
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+# What `published` may hold against a scenario's chain or modes without a run; see exact.
+ExactFigure = Literal[
+    "expected_steps_to_end", "expected_steps_in_mode", "expected_transitions", "manoeuvring_index"
+]
 Matrix = list[list[float]]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 PerAxis = list[NonNegative]
@@ -245,9 +249,10 @@ class WindowForm(Form):
 
 
 class ScoringForm(Form):
-    """What isn't scored at all."""
+    """What isn't scored at all, and whether tables and figures show squared errors or roots."""
 
     skip_scans: Annotated[int, Field(ge=0)] = 0
+    error: Literal["rmse", "mse"] = "rmse"
 
 
 class MonteCarloForm(Form):
@@ -259,16 +264,18 @@ class MonteCarloForm(Form):
 
 
 class ClaimForm(Form):
-    """A published claim: a figure of one estimator, or a comparison of two."""
+    """A published claim: a figure of one estimator, a comparison of two, or an exact figure."""
 
     claim: str
-    metric: Annotated[str, Field(json_schema_extra={"enum": [*METRICS]})]
+    metric: Annotated[str | None, Field(json_schema_extra={"enum": [*METRICS, None]})] = None
+    figure: ExactFigure | None = None
+    mode: str | None = None
     estimator: str | None = None
     compare: Annotated[list[str], Field(min_length=2, max_length=2)] | None = None
     window: str = "all"
     value: float | None = None
     tolerance: NonNegative | None = None
-    sign: Literal["less", "greater"] | None = None
+    sign: Literal["less", "greater", "equal"] | None = None
     expect: Literal[
         "reproduced", "reproduced with stated assumptions", "direction only", "not reproduced"
     ]
@@ -276,8 +283,8 @@ class ClaimForm(Form):
 
     @pydantic.field_validator("metric")
     @classmethod
-    def _known_metric(cls, metric: str) -> str:
-        if metric not in METRICS:
+    def _known_metric(cls, metric: str | None) -> str | None:
+        if metric is not None and metric not in METRICS:
             raise PydanticCustomError(
                 "unknown_metric", "must be one of {names}", {"names": ", ".join(METRICS)}
             )

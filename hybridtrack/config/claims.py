@@ -1,0 +1,132 @@
+"""Published claims: what they need, and whether the scenario can be held against them."""
+
+from hybridtrack.config import checks
+from hybridtrack.config.description import ChosenEstimator
+from hybridtrack.config.exact import exact_figure
+from hybridtrack.config.reader import Document, Keys
+from hybridtrack.config.schema import ClaimForm, ScenarioForm
+from hybridtrack.simulation import Case, Sensor
+from hybridtrack.statistics import METRICS
+from hybridtrack.verdicts import Claim, printed_tolerance
+
+
+def built_claim(
+    i: int,
+    form: ScenarioForm,
+    chosen: tuple[ChosenEstimator, ...],
+    cases: tuple[Case, ...],
+    sensor: Sensor,
+    document: Document,
+) -> Claim:
+    """The i-th claim: on one estimator, on two, or on the scenario alone."""
+    claim = form.published[i]
+    path: Keys = ("published", i)
+    kinds = ("estimator", "compare", "figure")
+    given = [kind for kind in kinds if getattr(claim, kind) is not None]
+    if len(given) != 1:
+        raise document.error(path, "a claim needs one of 'estimator', 'compare' and 'figure'")
+    exact = None
+    if claim.figure is not None:
+        _check_exact(claim, document, path)
+        exact = exact_figure(claim, cases, sensor, document, path)
+    else:
+        _check_of_runs(claim, form, chosen, document, path)
+    if claim.compare is None and claim.value is None:
+        raise document.error(path, "'value' is missing in this claim on one figure; add it")
+    if claim.compare is None and claim.sign not in (None, *(("less", "greater") * (exact is None))):
+        raise document.error(
+            (*path, "sign"), f"'sign' {claim.sign} has no place in this claim; remove it"
+        )
+    figure = claim.figure if claim.mode is None else f"{claim.figure} of {claim.mode}"
+    value = 1.0 if claim.sign == "equal" and claim.value is None else claim.value
+    return Claim(
+        claim=claim.claim,
+        estimator=claim.estimator,
+        compare=None if claim.compare is None else (claim.compare[0], claim.compare[1]),
+        metric=claim.metric or str(figure),
+        window=claim.window,
+        value=value,
+        tolerance=_tolerance(claim, document, path),
+        sign=claim.sign,
+        expect=claim.expect,
+        because=claim.because,
+        exact=exact,
+    )
+
+
+def _check_exact(claim: ClaimForm, document: Document, path: Keys) -> None:
+    for key in ("metric", "window"):
+        if key in claim.model_fields_set:
+            raise document.error(
+                (*path, key), f"'{key}' is a run's, and 'figure' needs none; remove one of them"
+            )
+
+
+def _check_of_runs(
+    claim: ClaimForm,
+    form: ScenarioForm,
+    chosen: tuple[ChosenEstimator, ...],
+    document: Document,
+    path: Keys,
+) -> None:
+    """Estimators, metric and window that there are."""
+    labels = ("raw", *form.estimators)
+    if claim.metric is None:
+        raise document.error(path, "'metric' is missing in this claim; add it")
+    if claim.mode is not None:
+        raise document.error((*path, "mode"), "'mode' belongs to a claim with 'figure'; remove it")
+    for key, names in (("estimator", [claim.estimator]), ("compare", claim.compare or [])):
+        for label in names:
+            if label is not None and label not in labels:
+                raise document.error(
+                    (*path, key),
+                    f"'{label}' is no estimator here; {checks.nearest(label, labels)}",
+                )
+            if label is not None:
+                _check_metric(label, claim.metric, chosen, document, path)
+    if claim.compare is not None and claim.compare[0] == claim.compare[1]:
+        raise document.error(
+            (*path, "compare"), f"'compare' names {claim.compare[0]} twice; name two estimators"
+        )
+    if claim.compare is not None and claim.sign is None:
+        raise document.error(
+            path, "'sign' is missing in this comparison; add less, greater or equal"
+        )
+    if claim.sign == "equal" and claim.tolerance is None:
+        raise document.error(
+            path, "'tolerance' is missing: how far from 1 may the ratio of two that are equal be?"
+        )
+    if claim.window != "all" and claim.window not in form.windows:
+        raise document.error(
+            (*path, "window"),
+            f"window '{claim.window}' is not defined; "
+            f"{checks.nearest(claim.window, ('all', *form.windows))}",
+        )
+
+
+def _check_metric(
+    label: str, metric: str, chosen: tuple[ChosenEstimator, ...], document: Document, path: Keys
+) -> None:
+    """A metric that the estimator has: raw measurements are positions, one mode needs no guess."""
+    known: tuple[str, ...] = ("position_",)
+    for one in chosen:
+        if one.label == label:
+            several = len(one.bank.modes) > 1
+            known = ("position_", "velocity_", *(("mode_", "true_", "likelihood_") * several))
+            if one.estimator.tells_final_mode(one.settings):
+                known = (*known, "final_mode_")
+    if not metric.startswith(known):
+        there = ", ".join(name for name in METRICS if name.startswith(known))
+        raise document.error(
+            (*path, "metric"), f"'metric' is {metric}, which {label} doesn't have; it has {there}"
+        )
+
+
+def _tolerance(claim: ClaimForm, document: Document, path: Keys) -> float:
+    """As given, else half a unit of the last digit that is printed."""
+    if claim.tolerance is not None or claim.value is None:
+        return claim.tolerance or 0.0
+    try:
+        return printed_tolerance(document.source_text((*path, "value")) or "")
+    except (ValueError, OverflowError):  # not in plain decimals
+        return printed_tolerance(f"{claim.value:.15g}")

@@ -1,0 +1,77 @@
+"""Figures that follow from a scenario alone, for claims that need no run."""
+
+import numpy as np
+
+from hybridtrack.chains import (
+    expected_steps_in_mode,
+    expected_steps_to_end,
+    expected_transitions,
+)
+from hybridtrack.config import checks
+from hybridtrack.config.reader import Document, Keys
+from hybridtrack.config.schema import ClaimForm
+from hybridtrack.models import ModeBank
+from hybridtrack.simulation import Case, ChainTruth, Sensor, step_lengths, truth_model
+
+OF_MODES = ("expected_steps_in_mode", "manoeuvring_index")
+
+
+def exact_figure(
+    claim: ClaimForm, cases: tuple[Case, ...], sensor: Sensor, document: Document, path: Keys
+) -> float:
+    """The value of a claim's `figure`: of the truth's chain, or of one of its modes."""
+    name, truth = claim.figure, cases[0].truth
+    if not isinstance(truth, ChainTruth):
+        raise document.error(
+            (*path, "figure"), f"'{name}' is a chain's, and the truth has none; remove the claim"
+        )
+    step_s = step_lengths(cases[0].times_s)
+    if np.ptp(step_s):
+        raise document.error(
+            (*path, "figure"), f"'{name}' counts steps of one length, and these are uneven"
+        )
+    mode = _mode(claim, truth.bank, document, path)
+    if name == "manoeuvring_index":
+        return _manoeuvring_index(mode, truth.bank, float(step_s[0]), sensor, document, path)
+    model = truth_model(truth, step_s[:1])
+    if name == "expected_steps_in_mode":
+        return float(expected_steps_in_mode(model.transition_matrix[0])[mode])
+    if name == "expected_transitions":
+        start = model.initial_mode_probabilities
+        return expected_transitions(truth.bound.supermodes(model.transition_matrix, start))
+    if truth.bound.continuation_probability is None:
+        raise document.error(
+            (*path, "figure"),
+            f"'{name}' is that of a soft bound, and the truth's chain has no "
+            "'continuation_probability'",
+        )
+    return expected_steps_to_end(truth.bound.continuation_probability)
+
+
+def _mode(claim: ClaimForm, bank: ModeBank, document: Document, path: Keys) -> int:
+    """Which mode a figure is of, 0 for one that is of the whole chain."""
+    if claim.figure not in OF_MODES:
+        if claim.mode is not None:
+            raise document.error(
+                (*path, "mode"), f"'{claim.figure}' is the whole chain's; remove 'mode'"
+            )
+        return 0
+    if claim.mode is None:
+        raise document.error(path, f"'mode' is missing: '{claim.figure}' is one mode's; add it")
+    checks.known_mode(claim.mode, bank.names, document, (*path, "mode"))
+    return bank.names.index(claim.mode)
+
+
+def _manoeuvring_index(
+    mode: int, bank: ModeBank, step_s: float, sensor: Sensor, document: Document, path: Keys
+) -> float:
+    """sigma_w T^2 / sigma_v (Bar-Shalom, Li, Kirubarajan 2001, eq. 6.5.3-13)."""
+    std = bank.modes[mode].parameters.get("acceleration_std_m_s2")
+    variances = np.diagonal(sensor.noise_covariance, axis1=1, axis2=2)
+    if std is None or np.ptp(variances):
+        raise document.error(
+            (*path, "figure"),
+            "a 'manoeuvring_index' needs a mode with an 'acceleration_std_m_s2' and one "
+            "'position_std_m'",
+        )
+    return float(std) * step_s**2 / float(np.sqrt(variances.flat[0]))
