@@ -259,9 +259,14 @@ def draw_figures(folder: Path) -> list[Path]:
         runs=manifest["runs"],
         estimators=tuple(manifest["estimators"]),
         modes=tuple(manifest["modes"]),
+        error=manifest["error"],
+        compare_with=manifest["compare_with"],
     )
-    steps, tracks = (results.read_columns(folder, name) for name in ("steps", "tracks"))
-    paths = figures.save(figures.draw(steps, tracks, information), folder / "figures")
+    steps, tracks, reliability = (
+        results.read_columns(folder, name) for name in ("steps", "tracks", "reliability")
+    )
+    drawn = figures.draw(steps, tracks, reliability, information)
+    paths = figures.save(drawn, folder / "figures")
     noted = manifest | {"figures": [path.name for path in paths]}
     if noted != manifest and results.read_manifest(folder) == manifest:  # nobody went on meanwhile
         results.write_text(folder / results.MANIFEST, encoder.dumps(noted, indent=2) + "\n")

@@ -44,6 +44,8 @@ WIDTH_IN = 7.0  # two columns of a journal page
 HALVES = np.array([-0.5, 0.5])
 LOG_SCALE_RATIO = 15.0
 LEAVES_THE_FRAME = 1e5  # a curve this many times the best one's median has nothing left to tell
+HOPELESS = 100.0  # a curve whose own median is so many times the best's is named, not drawn
+NEARLY_AS_GOOD = 1.3  # ratios whose median is within this of the best's make the frame
 
 # Okabe & Ito (2008) without black (the truth) and yellow (faint on white); the last two, wine and
 # olive, are from Tol's muted scheme (2021). The dashes tell the curves apart in grey.
@@ -82,6 +84,8 @@ class RunInformation(NamedTuple):
     runs: int
     estimators: tuple[str, ...]
     modes: tuple[str, ...]
+    error: str = "rmse"  # or mse: what errors over time are
+    compare_with: str | None = None  # the estimator that ratios are to
 
 
 class Look(NamedTuple):
@@ -95,28 +99,37 @@ class Look(NamedTuple):
 Looks = Mapping[str, Look]
 
 
-def draw(steps: Table, tracks: Table, information: RunInformation) -> dict[str, Figure]:
+def draw(
+    steps: Table, tracks: Table, reliability: Table, information: RunInformation
+) -> dict[str, Figure]:
     """Draw what the tables of a run folder hold; a figure whose data are absent is left out.
 
     Args:
         steps: long, columns case, estimator, step, time_s, metric, value, standard_error.
         tracks: long, columns case, run, estimator, step, time_s, quantity, value (SI units).
-        information: title, number of runs, and the order of estimators and modes.
+        reliability: columns estimator, from_probability, to_probability, share_of_steps,
+            mean_probability, frequency, standard_error.
+        information: title, number of runs, the order of estimators and modes, what is compared.
 
     Returns:
         Figures by name: trajectory (of the first run in `tracks`), position_error,
-        velocity_error, mode_probability and mode_likelihood. With several cases the figures over
-        time are drawn for each of the first six, and their names end in `-CASE`.
+        velocity_error, error_ratio, mode_probability, mode_likelihood, final_mode_probability and
+        reliability. With several cases the figures over time are drawn for each of the first six,
+        and their names end in `-CASE`.
     """
     with _style():
         looks = _looks(steps, tracks, information)
         figures = {"trajectory": _draw_trajectory(tracks, looks, information)}
         for case in split_cases(steps, information.title):
-            for quantity, unit in (("position", "m"), ("velocity", "m/s")):
-                figure = _draw_error(case, quantity, unit, looks, information.runs)
+            for quantity in ("position", "velocity"):
+                figure = _draw_error(case, quantity, looks, information)
                 figures[f"{quantity}_error{case.suffix}"] = figure
+            figures["error_ratio" + case.suffix] = _draw_ratios(case, looks, information)
             for metric in ("mode_probability", "mode_likelihood"):
                 figures[metric + case.suffix] = _draw_modes(case, metric, looks, information)
+            name = "final_mode_probability"
+            figures[name + case.suffix] = _draw_final_mode(case, looks, information)
+        figures["reliability"] = _draw_reliability(reliability, looks, information)
     return {name: figure for name, figure in figures.items() if figure is not None}
 
 
@@ -253,18 +266,118 @@ def _extent(paths: Iterable[Array]) -> Array:
 # ---- figures over time ----
 
 
-def _draw_error(case: Case, quantity: str, unit: str, looks: Looks, runs: int) -> Figure | None:
-    curves = chosen_curves(case.curves, f"{quantity}_rmse_{unit.replace('/', '_')}", looks)
+# By what errors are and of what: metric, and unit of the axis.
+ERRORS = {
+    ("rmse", "position"): ("position_rmse_m", "m"),
+    ("rmse", "velocity"): ("velocity_rmse_m_s", "m/s"),
+    ("mse", "position"): ("position_mse_m2", "m²"),
+    ("mse", "velocity"): ("velocity_mse_m2_s2", "m²/s²"),
+}
+ERROR_NAMES = {"rmse": "RMS", "mse": "mean square"}
+
+
+def _draw_error(
+    case: Case, quantity: str, looks: Looks, information: RunInformation
+) -> Figure | None:
+    metric, unit = ERRORS[information.error, quantity]
+    curves, beyond = _worth_drawing(chosen_curves(case.curves, metric, looks))
     if not curves:
         return None
     figure, (ax,) = _panels(1, 1, 3.0)
     for name, curve in curves.items():
         _plot_curve(ax, curve, looks[name])
     _mark_switches(ax, switch_times(case.truth))
-    leaving = _scale_error(ax, {name: curve.value for name, curve in curves.items()})
+    leaving = beyond + _scale_error(ax, {name: curve.value for name, curve in curves.items()})
     _frame_time([ax], curves.values(), case.truth)
-    ax.set_ylabel(f"{quantity} RMS error ({unit})")
-    _finish(figure, case.title, f"RMS {_over(curves.values(), runs)}", leaving)
+    name = ERROR_NAMES[information.error]
+    ax.set_ylabel(f"{quantity} {name} error ({unit})")
+    caption = f"{name[0].upper() + name[1:]} {_over(curves.values(), information.runs)}"
+    _finish(figure, case.title, caption, leaving)
+    return figure
+
+
+def _worth_drawing(curves: Mapping[str, Curve]) -> tuple[dict[str, Curve], list[str]]:
+    """The curves that are not hopeless beside the best one, and the names of those that are."""
+    middle = {name: float(np.nanmedian(curve.value)) for name, curve in curves.items()}
+    limit = HOPELESS * min(middle.values(), default=math.nan)
+    beyond = [name for name in curves if middle[name] > limit > 0.0]
+    return {name: curve for name, curve in curves.items() if name not in beyond}, beyond
+
+
+def _draw_ratios(case: Case, looks: Looks, information: RunInformation) -> Figure | None:
+    """Errors over those of one estimator: what tells estimators apart that are nearly as good."""
+    drawn = {
+        quantity: curves
+        for quantity in ("position", "velocity")
+        if (curves := chosen_curves(case.curves, f"{quantity}_{information.error}_ratio", looks))
+    }
+    if not drawn or information.compare_with is None:
+        return None
+    figure, axes = _panels(len(drawn), 1, 0.4 + 2.1 * len(drawn), sharey=False)
+    leaving: dict[str, None] = {}
+    for ax, quantity in zip(axes, drawn, strict=True):
+        curves, beyond = _worth_drawing(drawn[quantity])
+        drawn[quantity] = curves
+        ax.axhline(1.0, color=TRUTH_COLOUR, linewidth=0.7, zorder=0.5)
+        for name, curve in curves.items():
+            _plot_curve(ax, curve, looks[name])
+        _mark_switches(ax, switch_times(case.truth))
+        leaving |= dict.fromkeys(beyond + _scale_ratio(ax, curves))
+        ax.set_ylabel(f"{quantity} error ratio")
+    every = [curve for curves in drawn.values() for curve in curves.values()]
+    _frame_time(axes[-1:], every, case.truth)
+    name = ERROR_NAMES[information.error]
+    caption = f"Ratio of {name} errors to {information.compare_with}'s, over the same "
+    caption += _over(every, information.runs).removeprefix("over ")
+    _finish(figure, case.title, caption, leaving)
+    return figure
+
+
+def _draw_final_mode(case: Case, looks: Looks, information: RunInformation) -> Figure | None:
+    """How likely the mode now is the last one: by the scans, and by the time alone."""
+    curves = chosen_curves(case.curves, "final_mode_probability", looks)
+    if not curves:
+        return None
+    figure, (ax,) = _panels(1, 1, 2.6)
+    for name, curve in curves.items():
+        _plot_curve(ax, curve, looks[name])
+        prior = case.curves.get((name, "final_mode_prior"))
+        if prior is not None:
+            label = f"{looks[name].label}, before any scan"
+            _plot_line(ax, prior.time, prior.value, Look(label, looks[name].colour, (0, (1, 2))))
+    truth = case.curves.get(("truth", "final_mode_probability"))
+    if truth is not None:
+        look = Look("truth: share of runs", TRUTH_COLOUR, (0, (4, 3)))
+        _plot_line(ax, truth.time, truth.value, look)
+    _frame_time([ax], curves.values(), case.truth)
+    ax.set(ylim=(-0.02, 1.02), ylabel="probability")
+    over = _over(curves.values(), information.runs)
+    _finish(figure, case.title, f"Mean probability that the mode now is the last one, {over}", [])
+    return figure
+
+
+def _draw_reliability(table: Table, looks: Looks, information: RunInformation) -> Figure | None:
+    """Frequencies over the probabilities that foretold them; below, how often each was given."""
+    names = [name for name in looks if name in set(table["estimator"])]
+    if not names:
+        return None
+    figure, (ax, below) = _panels(2, 1, 3.6, sharey=False, heights=(3, 1))
+    ax.plot([0, 1], [0, 1], color=TRUTH_COLOUR, linewidth=0.7, zorder=0.5)
+    for i, name in enumerate(names):
+        mine = np.asarray(table["estimator"]) == name
+        columns = ("mean_probability", "frequency", "standard_error", "share_of_steps")
+        given, came, error, share = (np.asarray(table[column])[mine] for column in columns)
+        look = looks[name]
+        style: dict[str, Any] = {"color": look.colour, "linestyle": look.dashes}
+        ax.errorbar(given, came, 2 * error, marker="o", markersize=3, label=look.label, **style)
+        edges = np.asarray(table["from_probability"])[mine]
+        width = (edges[1] - edges[0]) / (len(names) + 1)
+        below.bar(edges + (i + 1) * width, share, width, color=look.colour)
+    ax.set(xlim=(0, 1), ylim=(-0.02, 1.02), ylabel="share that was the last")
+    below.set(xlabel="probability that the mode now is the last one", ylabel="share of\nsteps")
+    below.set_ylim(bottom=0.0)
+    caption = f"Reliability over {information.runs:,} runs; bars: ±2 standard errors"
+    _finish(figure, information.title, caption, [])
     return figure
 
 
@@ -317,6 +430,29 @@ def _scale_error(ax: Axes, values: Mapping[str, Array]) -> list[str]:
     ax.yaxis.set_major_formatter(_plain_numbers())
     ax.yaxis.set_minor_formatter(NullFormatter())
     return [name for name, value in values.items() if (value > high).any()]
+
+
+def _scale_ratio(ax: Axes, curves: Mapping[str, Curve]) -> list[str]:
+    """A frame about what is nearly as good as the best; returns the curves that leave it for long.
+
+    A few steps may go beyond it, such as the first after a start that is known exactly.
+    """
+    middle = {name: float(np.nanmedian(curve.value)) for name, curve in curves.items()}
+    near = [
+        curves[name].value
+        for name, m in middle.items()
+        if m <= NEARLY_AS_GOOD * min(middle.values())
+    ]
+    low = min(1.0, *(float(np.nanquantile(value, 0.02)) for value in near))
+    high = max(1.0, *(float(np.nanquantile(value, 0.98)) for value in near))
+    room = 0.08 * max(high - low, 1e-3)
+    ax.set_ylim(low - room, high + room)
+    ax.yaxis.set_major_formatter(_plain_numbers())
+    return [
+        name
+        for name, curve in curves.items()
+        if ((curve.value < low - room) | (curve.value > high + room)).mean() > 0.05
+    ]
 
 
 def _over(curves: Iterable[Curve], runs: int) -> str:
@@ -384,10 +520,19 @@ def _frame_time(bottom: Iterable[Axes], curves: Iterable[Curve], truth: Truth | 
 # ---- around the axes ----
 
 
-def _panels(rows: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+def _panels(
+    rows: int,
+    columns: int,
+    height: float,
+    *,
+    sharey: bool = True,
+    heights: tuple[float, ...] | None = None,
+) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(WIDTH_IN, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(
+        rows, columns, sharex=True, sharey=sharey, squeeze=False, height_ratios=heights
+    )
     return figure, list(axes.flat)
 
 

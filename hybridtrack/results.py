@@ -33,7 +33,8 @@ SHARDS, UNFINISHED, FIGURES = "shards", "unfinished", "figures"
 SHARD_NAME = re.compile(r"(?P<place>\d{4,}-\d{6,})-(?P<runs>\d+)")  # place: case and first block
 PART_NAME = re.compile(r"\..+\.\d+\.part(ial)?")
 FIGURE_NAME = re.compile(
-    r"(trajectory|(position|velocity)_error|mode_(probability|likelihood))(-.+)?\.png"
+    r"(trajectory|(position|velocity)_error|error_ratio|(final_)?mode_(probability|likelihood)"
+    r"|reliability)(-.+)?\.png"
 )
 FINISHED: dict[str, type | tuple[type, ...]] = {  # what a finished run's manifest is asked for
     "name": str,

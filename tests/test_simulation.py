@@ -38,11 +38,18 @@ SIGMAS = 5.0
 ROUNDING = 1e-9  # metres at 1e5 m: 1e-16 relative, some 1e2 operations
 
 
-def simulate(case, sensor, *, seed=1, case_index=0, block=0, lanes=BLOCK_RUNS, length=1000):
-    """One block whole: (initial state, state, mode, since_switch_s, measurements)."""
-    simulation = BlockSimulation(case, sensor, seed, case_index, block, lanes)
+def simulate(
+    case, sensor, *, seed=1, case_index=0, block=0, lanes=BLOCK_RUNS, length=1000, foresees=False
+):
+    """One block whole: (initial state, state, mode, since_switch_s, measurements).
+
+    With `foresees` also whether the mode is the last one, before the measurements.
+    """
+    simulation = BlockSimulation(case, sensor, seed, case_index, block, lanes, foresees=foresees)
     parts = [simulation.advance(span) for span in spans(len(case.times_s) - 1, length)]
     joined = [np.concatenate(arrays) for arrays in zip(*(p.truth for p in parts), strict=True)]
+    if not foresees:
+        assert joined.pop().size == 0
     return simulation.initial_state, *joined, np.concatenate([p.measurements for p in parts])
 
 
@@ -238,10 +245,10 @@ def cases():
 def test_a_run_depends_neither_on_lanes_nor_on_spans(name):
     case = cases()[name]
     by_mode = SENSOR._replace(noise_covariance=np.stack([CORRELATED, 4.0 * np.eye(2)]))
-    for sensor in (SENSOR, by_mode):
-        whole = simulate(case, sensor)
+    for sensor, foresees in ((SENSOR, False), (by_mode, True)):
+        whole = simulate(case, sensor, foresees=foresees)
         for lanes, length in [(BLOCK_RUNS, 1), (BLOCK_RUNS, 32), (5, 1000), (64, 7), (1, 69)]:
-            part = simulate(case, sensor, lanes=lanes, length=length)
+            part = simulate(case, sensor, lanes=lanes, length=length, foresees=foresees)
             for ours, theirs in zip(part, whole, strict=True):
                 expected = theirs[..., :lanes]
                 assert ours.shape == expected.shape
@@ -442,6 +449,49 @@ def test_time_since_a_switch_of_legs():
     inf = math.inf
     assert since_switch_s[:, 0].tolist() == [inf, inf, 0.5, 2.0, 3.5, 4.0, 2.0, 2.5]
     assert since_switch_s[:, 0].tolist() == switches(times_s, mode[:, 0], 0)
+
+
+BOUNDS = {
+    "none": Bound(),
+    "soft": Bound(continuation_probability=0.9),
+    "hard": Bound(most_transitions=2),
+}
+
+
+@pytest.mark.parametrize("kind", BOUNDS)
+def test_the_last_mode_is_foretold(kind):
+    """Against the modes as they come; beyond the last step the chain's own story goes on."""
+    bound, initial = BOUNDS[kind], np.array([0.0, 0.4, 0.6])
+    truth = chain(three_modes(initial))._replace(bound=bound)
+    case = Case("a", np.arange(26.0), truth)
+    blocks = [simulate(case, SENSOR, block=b, foresees=True) for b in range(12)]
+    mode, final = (np.concatenate([block[i] for block in blocks], axis=1) for i in (2, 4))
+    alone = [simulate(case, SENSOR, block=b)[2] for b in range(12)]
+    assert (np.concatenate(alone, axis=1) == mode).all()  # nothing else is drawn otherwise
+    assert np.isin(final, (0.0, 1.0)).all()
+    assert (np.diff(final, axis=0) >= 0).all()
+    switched = mode[1:] != mode[:-1]
+    assert (final[:-1][switched] == 0).all()
+    # From 0 to 1 by a switch and by nothing else: an end is no event of its own.
+    assert (switched[np.diff(final, axis=0) == 1]).all()
+    if kind == "none":
+        assert (final == 0).all()
+        return
+    # What the chain says before anything is seen, step by step; pruned and whole alike.
+    supermodes = bound.supermodes(ASYMMETRIC[np.newaxis], initial)
+    probability = supermodes.initial_probabilities
+    for k in range(25):
+        probability = probability @ supermodes.transition_matrix[0]
+        assert_mean(final[k], probability @ supermodes.final_probability[0])
+
+
+def test_the_last_leg_is_the_last_mode():
+    legs = (Leg(3.0, 0.0, 1.0, 0), Leg(6.0, 0.0, 1.0, 1), Leg(9.0, 0.0, 2.0, 1))
+    times_s = np.arange(10.0)
+    for n, expected in ((3, [0, 0, 0, 1, 1, 1, 1, 1, 1]), (1, [1] * 9)):
+        flown = fly((*legs[: n - 1], legs[2]), times_s, (0.0, 0.0), 0.0)
+        final = simulate(Case("a", times_s, flown), SENSOR, foresees=True, length=4)[4]
+        assert final[:, 0].tolist() == expected
 
 
 def test_a_truth_without_modes_never_switches():
