@@ -12,6 +12,7 @@ from hybridtrack.config import Experiment, Window
 from hybridtrack.estimators import NO_KNOWN_MODES, Estimates, Prepared, Running, prepare
 from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
+from hybridtrack.roots import square_root
 from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import (
     BLOCK_RUNS,
@@ -20,7 +21,6 @@ from hybridtrack.simulation import (
     Scans,
     TruthSpan,
     spans,
-    square_root,
     step_lengths,
     two_point_start,
 )

@@ -6,7 +6,6 @@ depends neither on how many runs were asked for nor on the length of spans.
 """
 
 import enum
-import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -17,6 +16,8 @@ from hybridtrack.chains import Bound, Supermodes
 from hybridtrack.compiled import kernel
 from hybridtrack.errors import UserError
 from hybridtrack.models import Array, JumpMarkovModel, ModeBank
+from hybridtrack.roots import square_root
+from hybridtrack.sensors import Noise, Sensor
 
 BLOCK_RUNS = 256  # runs drawn and filtered together
 
@@ -164,35 +165,7 @@ def _drive(state, modes, noise, state_transition, input_effect, noise_root, out)
     state[:] = out[-1]
 
 
-def square_root(covariance: Array) -> Array:
-    """L (..., n, n) with L L' = covariance, which may be singular."""
-    if covariance.size > 256:  # many steps of their own lengths: not worth remembering
-        return _square_root(covariance)
-    return _known_square_root(covariance.tobytes(), covariance.shape)
-
-
-def _square_root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))[..., np.newaxis, :]
-    return root
-
-
-@functools.lru_cache  # every block begins with the same ones
-def _known_square_root(covariance: bytes, shape: tuple[int, ...]) -> Array:
-    root = _square_root(np.frombuffer(covariance).reshape(shape))
-    root.flags.writeable = False
-    return root
-
-
-# ---- the sensor ------------------------------------------------------------------------------
-
-
-class Sensor(NamedTuple):
-    """What is measured: positions with Gaussian noise, some scans missed."""
-
-    noise_covariance: Array  # (n_modes or 1, n_y, n_y) by the truth's mode
-    detection_probability: float
-    certain_scans: int  # the first scans are never missed (a track starts with detections)
+# ---- what is seen of it ----------------------------------------------------------------------
 
 
 class Scans(NamedTuple):
@@ -245,10 +218,8 @@ class BlockSimulation:
         self._sensor = sensor
         self._key = (seed, case_index, block)
         self._streams: dict[Purpose, np.random.Generator] = {}
-        self._noise_root = square_root(sensor.noise_covariance)
-        axes = np.diagonal(self._noise_root, axis1=1, axis2=2)[..., np.newaxis]  # (n_modes, n_y, 1)
-        alone = len(axes) == 1 and not np.any(self._noise_root[0] - np.diag(axes[0, :, 0]))
-        self._noise_std = axes[0] if alone else None  # where axes are independent of one another
+        self._noise = Noise(sensor.noise_covariance)
+        self._may_be_outliers = sensor.may_be_outliers(case.times_s)
         self.fixed: TruthSpan | None = None  # the truth of all steps, if every run has the same
         truth = case.truth
         if isinstance(truth, ChainTruth):
@@ -308,26 +279,20 @@ class BlockSimulation:
             scans = self._case.recorded[span.start + 1 : span.stop + 1, :, np.newaxis]
             return Scans(truth, np.repeat(scans, BLOCK_RUNS, axis=2))
         draws = self._stream(Purpose.MEASUREMENT_NOISE).standard_normal((steps, n_y, BLOCK_RUNS))
-        measurements = self._shape_noise(draws, truth.mode)
+        measurements = self._noise.shape(draws, truth.mode)
         measurements += truth.state[:, self._positions]
+        if self._sensor.outliers is not None:
+            uniform = self._stream(Purpose.OUTLIERS).random((steps, 2, BLOCK_RUNS))
+            possible = self._may_be_outliers[span]
+            self._noise.add_outliers(
+                measurements, self._sensor.outliers, uniform, possible, truth.mode
+            )
         if self._sensor.detection_probability < 1.0:
             uniform = self._stream(Purpose.DETECTION).random((steps, BLOCK_RUNS))
             missed = uniform >= self._sensor.detection_probability
             missed[: max(self._sensor.certain_scans - span.start, 0)] = False
             measurements[np.repeat(missed[:, np.newaxis], n_y, axis=1)] = np.nan
         return Scans(truth, measurements)
-
-    def _shape_noise(self, draws: Array, modes: Modes) -> Array:
-        root = self._noise_root
-        if self._noise_std is not None:
-            draws *= self._noise_std
-            return draws
-        if len(root) == 1:
-            shaped: Array = np.einsum("ml,klb->kmb", root[0], draws)
-        else:
-            by_run = root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))]
-            shaped = np.einsum("kbml,klb->kmb", by_run, draws)
-        return shaped
 
     def _advance_truth(self, span: slice) -> TruthSpan:
         if self.fixed is not None:

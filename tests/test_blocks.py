@@ -20,12 +20,12 @@ from hybridtrack.config import Window
 from hybridtrack.executors import Stopped
 from hybridtrack.experiment import run as run_experiment
 from hybridtrack.outcomes import paired
+from hybridtrack.roots import square_root
 from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
     Purpose,
     TruthSpan,
-    square_root,
     stream,
 )
 from hybridtrack.statistics import POSITION_AT_SCANS

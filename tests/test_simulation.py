@@ -17,6 +17,8 @@ from scipy.integrate import solve_ivp
 from hybridtrack.errors import UserError
 from hybridtrack.models import Mode, ModeBank, generator_from_sojourns
 from hybridtrack.motion import Motion
+from hybridtrack.roots import square_root
+from hybridtrack.sensors import Outliers, Sensor
 from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
@@ -25,10 +27,8 @@ from hybridtrack.simulation import (
     FixedTruth,
     Leg,
     Purpose,
-    Sensor,
     fly,
     spans,
-    square_root,
     stream,
     two_point_start,
 )
@@ -238,7 +238,8 @@ def cases():
 def test_a_run_depends_neither_on_lanes_nor_on_spans(name):
     case = cases()[name]
     by_mode = SENSOR._replace(noise_covariance=np.stack([CORRELATED, 4.0 * np.eye(2)]))
-    for sensor in (SENSOR, by_mode):
+    outliers = Outliers(0.3, 20.0, 3.0, 40.0)
+    for sensor in (SENSOR, by_mode, by_mode._replace(outliers=outliers)):
         whole = simulate(case, sensor)
         for lanes, length in [(BLOCK_RUNS, 1), (BLOCK_RUNS, 32), (5, 1000), (64, 7), (1, 69)]:
             part = simulate(case, sensor, lanes=lanes, length=length)
