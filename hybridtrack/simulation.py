@@ -7,21 +7,16 @@ depends neither on how many runs were asked for nor on the length of spans.
 
 import enum
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hybridtrack.chains import Bound, Supermodes
-from hybridtrack.compiled import kernel
 from hybridtrack.errors import UserError
-from hybridtrack.models import Array, JumpMarkovModel, ModeBank
-from hybridtrack.roots import square_root
+from hybridtrack.jumps import ChainTruth, JumpRuns, Modes
+from hybridtrack.models import Array
 from hybridtrack.sensors import Noise, Sensor
 
 BLOCK_RUNS = 256  # runs drawn and filtered together
-
-Modes = NDArray[np.int64]
 
 
 class Purpose(enum.IntEnum):
@@ -102,17 +97,7 @@ def _arc(leg: Leg, elapsed_s: Array, position: Array, heading: float) -> Array:
     )
 
 
-# ---- a simulated chain -----------------------------------------------------------------------
-
-
-class ChainTruth(NamedTuple):
-    """States simulated from a jump Markov model of their own, other in every run."""
-
-    bank: ModeBank
-    initial_mean: Array  # (n_x,)
-    initial_covariance: Array  # (n_x, n_x); 0 for a fixed start
-    bound: Bound = Bound()  # on how often the mode changes
-
+# ---- truth and measurements of a span --------------------------------------------------------
 
 Truth = FixedTruth | ChainTruth
 
@@ -127,45 +112,6 @@ class TruthSpan(NamedTuple):
     def cut(self, steps: slice) -> "TruthSpan":
         """Some of the steps."""
         return TruthSpan(self.state[steps], self.mode[steps], self.since_switch_s[steps])
-
-
-@kernel
-def _draw_modes(mode, uniform, cumulative, out):
-    for k in range(uniform.shape[0]):
-        rows = cumulative[k if cumulative.shape[0] > 1 else 0]
-        for b in range(uniform.shape[1]):
-            j = 0
-            while j < rows.shape[1] - 1 and uniform[k, b] >= rows[mode[b], j]:
-                j += 1
-            mode[b] = j
-            out[k, b] = j
-
-
-@kernel
-def _drive(state, modes, noise, state_transition, input_effect, noise_root, out):
-    """x <- F_j x + b_j + L_j w, j the mode of each lane, every mode's in turn: rows of lanes."""
-    n_x, lanes = state.shape
-    row = np.empty(lanes)
-    for k in range(modes.shape[0]):
-        f = k if state_transition.shape[0] > 1 else 0
-        before = out[k - 1] if k > 0 else state
-        for j in range(state_transition.shape[1]):
-            for a in range(n_x):
-                row[:] = input_effect[f, j, a]
-                for e in range(n_x):
-                    transition, root = state_transition[f, j, a, e], noise_root[f, j, a, e]
-                    if transition != 0.0:
-                        for b in range(lanes):
-                            row[b] += transition * before[e, b]
-                    if root != 0.0:
-                        for b in range(lanes):
-                            row[b] += root * noise[k, e, b]
-                for b in range(lanes):
-                    out[k, a, b] = row[b] if modes[k, b] == j else out[k, a, b]
-    state[:] = out[-1]
-
-
-# ---- what is seen of it ----------------------------------------------------------------------
 
 
 class Scans(NamedTuple):
@@ -226,16 +172,9 @@ class BlockSimulation:
             self.state_names = truth.bank.state_names
             n_x = len(self.state_names)
             draws = self._stream(Purpose.INITIAL_STATE).standard_normal((n_x, BLOCK_RUNS))
-            self._state = truth.initial_mean[:, None] + (
-                square_root(truth.initial_covariance) @ draws
-            )
             uniform = self._stream(Purpose.MODE_SEQUENCE).random(BLOCK_RUNS)
-            self._step_s = step_lengths(case.times_s)
-            chain = _chain(truth, truth_model(truth, self._step_s[:1]))
-            cumulative = np.cumsum(chain.initial_probabilities)[:-1]
-            self._supermode: Modes = np.searchsorted(cumulative, uniform, side="right")
-            self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
-            self.initial_state = self._state[:, :lanes].copy()
+            self._runs = JumpRuns(truth, step_lengths(case.times_s), uniform, draws)
+            self.initial_state = self._runs.state[:, :lanes].copy()
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
@@ -297,33 +236,11 @@ class BlockSimulation:
     def _advance_truth(self, span: slice) -> TruthSpan:
         if self.fixed is not None:
             return self.fixed.cut(span)
-        truth = self._case.truth
-        assert isinstance(truth, ChainTruth)
-        model = truth_model(truth, self._step_s[span])
-        steps, n_x = span.stop - span.start, len(self.state_names)
+        steps, rank = span.stop - span.start, self._runs.noise_rank
         uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
-        chain = _chain(truth, model)
-        supermodes = np.empty((steps, BLOCK_RUNS), dtype=np.int64)
-        before = chain.mode[self._supermode]
-        cumulative = np.cumsum(chain.transition_matrix, axis=-1)
-        _draw_modes(self._supermode, uniform, cumulative, supermodes)
-        modes = chain.mode[supermodes]
-        noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, n_x, BLOCK_RUNS))
-        state = np.empty((steps, n_x, BLOCK_RUNS))
-        root = np.ascontiguousarray(square_root(model.process_noise_covariance))
-        arguments: tuple[Any, ...] = (model.state_transition, model.input_effect, root, state)
-        _drive(self._state, modes, noise, *arguments)
-        return TruthSpan(state, modes, self._chain_since_switch(span, before, modes))
-
-    def _chain_since_switch(self, span: slice, before: Modes, modes: Modes) -> Array:
-        times_s = self._case.times_s
-        since = np.empty(modes.shape)
-        for k in range(len(modes)):
-            switched = modes[k] != before
-            self._last_switch_s[switched] = times_s[span.start + k]
-            since[k] = times_s[span.start + k + 1] - self._last_switch_s
-            before = modes[k]
-        return since
+        noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, rank, BLOCK_RUNS))
+        times_s = self._case.times_s[span.start : span.stop + 1]
+        return TruthSpan(*self._runs.advance(span, times_s, uniform, noise))
 
 
 def _since_switch(times_s: Array, modes: Modes) -> Array:
@@ -332,15 +249,6 @@ def _since_switch(times_s: Array, modes: Modes) -> Array:
     switched = np.flatnonzero(modes[2:] != modes[1:-1]) + 2
     began[switched] = times_s[switched - 1]
     return times_s - np.maximum.accumulate(began)
-
-
-def truth_model(truth: ChainTruth, step_s: Array) -> JumpMarkovModel:
-    """The truth's own jump Markov model for the given steps."""
-    return truth.bank.discretise(step_s, truth.initial_mean, truth.initial_covariance)
-
-
-def _chain(truth: ChainTruth, model: JumpMarkovModel) -> Supermodes:
-    return truth.bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
 
 
 def two_point_start(

@@ -15,7 +15,8 @@ from hybridtrack.config import Experiment, dump, json_schema, load, shipped
 from hybridtrack.config.reader import read
 from hybridtrack.errors import UserError
 from hybridtrack.experiment import digest
-from hybridtrack.simulation import ChainTruth, FixedTruth
+from hybridtrack.jumps import ChainTruth
+from hybridtrack.simulation import FixedTruth
 from scenarios import (
     CHAIN,
     FIG5,

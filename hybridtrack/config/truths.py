@@ -11,9 +11,10 @@ from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import FileForm, RecordingForm, ScenarioForm, TruthForm
 from hybridtrack.config.validate import as_written
 from hybridtrack.errors import UserError
+from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.sensors import Outliers, Sensor
-from hybridtrack.simulation import Case, ChainTruth, FixedTruth, Leg, fly
+from hybridtrack.simulation import Case, FixedTruth, Leg, fly
 
 MAX_STEPS = 10_000_000
 
