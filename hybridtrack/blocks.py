@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from hybridtrack.config import Experiment, Window
 from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates
 from hybridtrack.executors import Stopped
-from hybridtrack.models import Array, JumpMarkovModel, ModeBank
+from hybridtrack.models import Array, Itself, JumpMarkovModel, ModeBank
+from hybridtrack.roots import square_root
 from hybridtrack.scoring import Given, Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import (
     BLOCK_RUNS,
@@ -20,7 +21,6 @@ from hybridtrack.simulation import (
     Scans,
     TruthSpan,
     spans,
-    square_root,
     step_lengths,
     two_point_start,
 )
@@ -143,20 +143,8 @@ def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) ->
     return mask
 
 
-class _Same(NamedTuple):
-    """A bank or an estimator as a key: itself, not its like, since arrays have no hash."""
-
-    one: Any
-
-    def __hash__(self) -> int:
-        return id(self.one)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.one is self.one
-
-
 @functools.lru_cache(maxsize=64)
-def _even_model(bank: _Same, step_s: float, covariance: bytes) -> JumpMarkovModel:
+def _even_model(bank: Itself, step_s: float, covariance: bytes) -> JumpMarkovModel:
     """The model of steps of one length, which blocks have in common."""
     one: ModeBank = bank.one
     n_x = len(one.state_names)
@@ -166,7 +154,7 @@ def _even_model(bank: _Same, step_s: float, covariance: bytes) -> JumpMarkovMode
 
 @functools.lru_cache(maxsize=64)
 def _prepared_for_even_steps(
-    bank: _Same, step_s: float, covariance: bytes, estimator: _Same, settings: Any
+    bank: Itself, step_s: float, covariance: bytes, estimator: Itself, settings: Any
 ) -> Any:
     """An estimator for such steps, which blocks have in common too."""
     return estimator.one.prepare(settings, _even_model(bank, step_s, covariance))
@@ -280,10 +268,10 @@ class _Block:
         for chosen in experiment.estimators:
             covariance = np.ascontiguousarray(covariances[id(chosen.bank)], dtype=np.float64)
             self._even[chosen.label] = _prepared_for_even_steps(
-                _Same(chosen.bank),
+                Itself(chosen.bank),
                 float(self._step_s[0]),
                 covariance.tobytes(),
-                _Same(chosen.estimator),
+                Itself(chosen.estimator),
                 chosen.settings,
             )
         # The one that others are compared with goes first, so that its scores are at hand.

@@ -16,6 +16,21 @@ from hybridtrack.motion import MOTION_MODELS, Motion
 Array = NDArray[np.float64]
 
 
+class Itself(NamedTuple):
+    """A bank, a truth or an estimator as a key of what is remembered about it.
+
+    Itself and not its like, since arrays have no hash.
+    """
+
+    one: Any
+
+    def __hash__(self) -> int:
+        return id(self.one)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Itself) and other.one is self.one
+
+
 class JumpMarkovModel(NamedTuple):
     """x_k = F x_{k-1} + b + w, z_k = H x_k + v, with F, b, Q, H, R of the mode at k.
 

@@ -6,23 +6,19 @@ depends neither on how many runs were asked for nor on the length of spans.
 """
 
 import enum
-import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridtrack.chains import Bound, Supermodes
-from hybridtrack.compiled import kernel
 from hybridtrack.errors import UserError
-from hybridtrack.models import Array, JumpMarkovModel, ModeBank
+from hybridtrack.jumps import ChainTruth, JumpRuns, Modes
+from hybridtrack.models import Array
+from hybridtrack.sensors import Noise, Sensor
 
 BLOCK_RUNS = 256  # runs drawn and filtered together
-
-Modes = NDArray[np.int64]
 NOT_FORESEEN: Array = np.zeros((0, 1))
-FORESEEN_STEPS = 75  # at a time
 
 
 class Purpose(enum.IntEnum):
@@ -103,17 +99,7 @@ def _arc(leg: Leg, elapsed_s: Array, position: Array, heading: float) -> Array:
     )
 
 
-# ---- a simulated chain -----------------------------------------------------------------------
-
-
-class ChainTruth(NamedTuple):
-    """States simulated from a jump Markov model of their own, other in every run."""
-
-    bank: ModeBank
-    initial_mean: Array  # (n_x,)
-    initial_covariance: Array  # (n_x, n_x); 0 for a fixed start
-    bound: Bound = Bound()  # on how often the mode changes
-
+# ---- truth and measurements of a span --------------------------------------------------------
 
 Truth = FixedTruth | ChainTruth
 
@@ -133,90 +119,6 @@ class TruthSpan(NamedTuple):
     def each(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> "TruthSpan":
         """The same change of every array."""
         return TruthSpan(*map(change, self))
-
-
-@kernel
-def _draw_modes(mode, uniform, cumulative, out):
-    for k in range(uniform.shape[0]):
-        rows = cumulative[k if cumulative.shape[0] > 1 else 0]
-        for b in range(uniform.shape[1]):
-            j = 0
-            while j < rows.shape[1] - 1 and uniform[k, b] >= rows[mode[b], j]:
-                j += 1
-            mode[b] = j
-            out[k, b] = j
-
-
-def _advance_modes(chain: Supermodes, supermode: Modes, uniform: Array) -> tuple[Modes, Modes]:
-    """The modes before a span and in it (n_steps, runs); `supermode` (runs,) moves along."""
-    supermodes = np.empty(uniform.shape, dtype=np.int64)
-    before = chain.mode[supermode]
-    _draw_modes(supermode, uniform, np.cumsum(chain.transition_matrix, axis=-1), supermodes)
-    return before, chain.mode[supermodes]
-
-
-@kernel
-def _note_switches(before, modes, start, last):
-    for k in range(modes.shape[0]):
-        for b in range(modes.shape[1]):
-            earlier = before[b] if k == 0 else modes[k - 1, b]
-            if modes[k, b] != earlier:
-                last[b] = start + k + 1
-
-
-@kernel
-def _drive(state, modes, noise, state_transition, input_effect, noise_root, out):
-    """x <- F_j x + b_j + L_j w, j the mode of each lane, every mode's in turn: rows of lanes."""
-    n_x, lanes = state.shape
-    row = np.empty(lanes)
-    for k in range(modes.shape[0]):
-        f = k if state_transition.shape[0] > 1 else 0
-        before = out[k - 1] if k > 0 else state
-        for j in range(state_transition.shape[1]):
-            for a in range(n_x):
-                row[:] = input_effect[f, j, a]
-                for e in range(n_x):
-                    transition, root = state_transition[f, j, a, e], noise_root[f, j, a, e]
-                    if transition != 0.0:
-                        for b in range(lanes):
-                            row[b] += transition * before[e, b]
-                    if root != 0.0:
-                        for b in range(lanes):
-                            row[b] += root * noise[k, e, b]
-                for b in range(lanes):
-                    out[k, a, b] = row[b] if modes[k, b] == j else out[k, a, b]
-    state[:] = out[-1]
-
-
-def square_root(covariance: Array) -> Array:
-    """L (..., n, n) with L L' = covariance, which may be singular."""
-    if covariance.size > 256:  # many steps of their own lengths: not worth remembering
-        return _square_root(covariance)
-    return _known_square_root(covariance.tobytes(), covariance.shape)
-
-
-def _square_root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))[..., np.newaxis, :]
-    return root
-
-
-@functools.lru_cache  # every block begins with the same ones
-def _known_square_root(covariance: bytes, shape: tuple[int, ...]) -> Array:
-    root = _square_root(np.frombuffer(covariance).reshape(shape))
-    root.flags.writeable = False
-    return root
-
-
-# ---- the sensor ------------------------------------------------------------------------------
-
-
-class Sensor(NamedTuple):
-    """What is measured: positions with Gaussian noise, some scans missed."""
-
-    noise_covariance: Array  # (n_modes or 1, n_y, n_y) by the truth's mode
-    detection_probability: float
-    certain_scans: int  # the first scans are never missed (a track starts with detections)
 
 
 class Scans(NamedTuple):
@@ -280,27 +182,22 @@ class BlockSimulation:
         self._sensor = sensor
         self._key = (seed, case_index, block)
         self._streams: dict[Purpose, np.random.Generator] = {}
-        self._noise_root = square_root(sensor.noise_covariance)
-        axes = np.diagonal(self._noise_root, axis1=1, axis2=2)[..., np.newaxis]  # (n_modes, n_y, 1)
-        alone = len(axes) == 1 and not np.any(self._noise_root[0] - np.diag(axes[0, :, 0]))
-        self._noise_std = axes[0] if alone else None  # where axes are independent of one another
+        self._noise = Noise(sensor.noise_covariance)
+        self._may_be_outliers = sensor.may_be_outliers(case.times_s)
         self.fixed: TruthSpan | None = None  # the truth of all steps, if every run has the same
         truth = case.truth
         if isinstance(truth, ChainTruth):
             self.state_names = truth.bank.state_names
             n_x = len(self.state_names)
             draws = self._stream(Purpose.INITIAL_STATE).standard_normal((n_x, BLOCK_RUNS))
-            self._state = truth.initial_mean[:, None] + (
-                square_root(truth.initial_covariance) @ draws
-            )
             uniform = self._stream(Purpose.MODE_SEQUENCE).random(BLOCK_RUNS)
-            self._step_s = step_lengths(case.times_s)
-            chain = _chain(truth, truth_model(truth, self._step_s[:1]))
-            cumulative = np.cumsum(chain.initial_probabilities)[:-1]
-            self._supermode: Modes = np.searchsorted(cumulative, uniform, side="right")
-            self._last_switch_s = np.full(BLOCK_RUNS, -np.inf)
-            self.initial_state = self._state[:, :lanes].copy()
-            self._last_switch = self._last_switches() if foresees else None
+            self._runs = JumpRuns(truth, step_lengths(case.times_s), uniform, draws)
+            self.initial_state = self._runs.state[:, :lanes].copy()
+            self._last_switch: Array | None = None
+            if foresees:  # the same modes, drawn once before their time
+                again = stream(*self._key, Purpose.MODE_SEQUENCE)
+                again.random(BLOCK_RUNS)
+                self._last_switch = self._runs.last_switches(again)
         else:
             self.state_names = truth.state_names
             self.initial_state = truth.state[0][:, np.newaxis]
@@ -341,8 +238,14 @@ class BlockSimulation:
             scans = self._case.recorded[span.start + 1 : span.stop + 1, :, np.newaxis]
             return Scans(truth, np.repeat(scans, BLOCK_RUNS, axis=2))
         draws = self._stream(Purpose.MEASUREMENT_NOISE).standard_normal((steps, n_y, BLOCK_RUNS))
-        measurements = self._shape_noise(draws, truth.mode)
+        measurements = self._noise.shape(draws, truth.mode)
         measurements += truth.state[:, self._positions]
+        if self._sensor.outliers is not None:
+            uniform = self._stream(Purpose.OUTLIERS).random((steps, 2, BLOCK_RUNS))
+            possible = self._may_be_outliers[span]
+            self._noise.add_outliers(
+                measurements, self._sensor.outliers, uniform, possible, truth.mode
+            )
         if self._sensor.detection_probability < 1.0:
             uniform = self._stream(Purpose.DETECTION).random((steps, BLOCK_RUNS))
             missed = uniform >= self._sensor.detection_probability
@@ -350,67 +253,18 @@ class BlockSimulation:
             measurements[np.repeat(missed[:, np.newaxis], n_y, axis=1)] = np.nan
         return Scans(truth, measurements)
 
-    def _shape_noise(self, draws: Array, modes: Modes) -> Array:
-        root = self._noise_root
-        if self._noise_std is not None:
-            draws *= self._noise_std
-            return draws
-        if len(root) == 1:
-            shaped: Array = np.einsum("ml,klb->kmb", root[0], draws)
-        else:
-            by_run = root[np.broadcast_to(modes, (len(draws), BLOCK_RUNS))]
-            shaped = np.einsum("kbml,klb->kmb", by_run, draws)
-        return shaped
-
     def _advance_truth(self, span: slice) -> TruthSpan:
         if self.fixed is not None:
             return self.fixed.cut(span)
-        truth = self._case.truth
-        assert isinstance(truth, ChainTruth)
-        model = truth_model(truth, self._step_s[span])
-        steps, n_x = span.stop - span.start, len(self.state_names)
+        steps, rank = span.stop - span.start, self._runs.noise_rank
         uniform = self._stream(Purpose.MODE_SEQUENCE).random((steps, BLOCK_RUNS))
-        before, modes = _advance_modes(_chain(truth, model), self._supermode, uniform)
-        noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, n_x, BLOCK_RUNS))
-        state = np.empty((steps, n_x, BLOCK_RUNS))
-        root = np.ascontiguousarray(square_root(model.process_noise_covariance))
-        arguments: tuple[Any, ...] = (model.state_transition, model.input_effect, root, state)
-        _drive(self._state, modes, noise, *arguments)
-        since_switch_s = self._chain_since_switch(span, before, modes)
+        noise = self._stream(Purpose.PROCESS_NOISE).standard_normal((steps, rank, BLOCK_RUNS))
+        times_s = self._case.times_s[span.start : span.stop + 1]
+        truth = TruthSpan(*self._runs.advance(span, times_s, uniform, noise))
         if self._last_switch is None:
-            return TruthSpan(state, modes, since_switch_s)
+            return truth
         step = np.arange(span.start, span.stop)[:, np.newaxis] + 1
-        final = (step >= self._last_switch).astype(np.float64)
-        return TruthSpan(state, modes, since_switch_s, final)
-
-    def _last_switches(self) -> Array:
-        """The step of each run's last switch of mode (BLOCK_RUNS,); 0: none; inf: after the end.
-
-        The modes are drawn once for this and once more when their time comes. What the chain does
-        after the last step is drawn too, so that its end is no switch's end.
-        """
-        truth = self._case.truth
-        assert isinstance(truth, ChainTruth)
-        draws = stream(*self._key, Purpose.MODE_SEQUENCE)
-        draws.random(BLOCK_RUNS)  # of the start
-        supermode, last = self._supermode.copy(), np.zeros(BLOCK_RUNS)
-        for span in spans(len(self._step_s), FORESEEN_STEPS):
-            chain = _chain(truth, truth_model(truth, self._step_s[span]))
-            uniform = draws.random((span.stop - span.start, BLOCK_RUNS))
-            before, modes = _advance_modes(chain, supermode, uniform)
-            _note_switches(before, modes, span.start, last)
-        last[draws.random(BLOCK_RUNS) >= chain.final_probability[-1, supermode]] = np.inf
-        return last
-
-    def _chain_since_switch(self, span: slice, before: Modes, modes: Modes) -> Array:
-        times_s = self._case.times_s
-        since = np.empty(modes.shape)
-        for k in range(len(modes)):
-            switched = modes[k] != before
-            self._last_switch_s[switched] = times_s[span.start + k]
-            since[k] = times_s[span.start + k + 1] - self._last_switch_s
-            before = modes[k]
-        return since
+        return truth._replace(final=(step >= self._last_switch).astype(np.float64))
 
 
 def _since_switch(times_s: Array, modes: Modes) -> Array:
@@ -427,15 +281,6 @@ def _final(modes: Modes) -> Array:
     final = np.zeros(len(modes))
     final[switches[-1] if switches.size else 0 :] = 1.0
     return final
-
-
-def truth_model(truth: ChainTruth, step_s: Array) -> JumpMarkovModel:
-    """The truth's own jump Markov model for the given steps."""
-    return truth.bank.discretise(step_s, truth.initial_mean, truth.initial_covariance)
-
-
-def _chain(truth: ChainTruth, model: JumpMarkovModel) -> Supermodes:
-    return truth.bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
 
 
 def two_point_start(

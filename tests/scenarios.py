@@ -22,7 +22,9 @@ clock: {step_s: 0.5, duration_s: 5}
 truth:
   chain:
     initial: {mean: [0, 10], covariance: [[4, 1], [1, 9]], mode_probabilities: [0.2, 0.8]}
-sensor: {position_std_m: 3}
+sensor:
+  position_std_m: 3
+  outliers: {probability: 0.1, size_sigma: 20, from_s: 0.5, until_s: 4}
 states: [x, vx]
 modes:
   slow:

@@ -20,12 +20,12 @@ from hybridtrack.config import Window
 from hybridtrack.executors import Stopped
 from hybridtrack.experiment import run as run_experiment
 from hybridtrack.outcomes import paired
+from hybridtrack.roots import square_root
 from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
     Purpose,
     TruthSpan,
-    square_root,
     stream,
 )
 from hybridtrack.statistics import POSITION_AT_SCANS
@@ -137,7 +137,8 @@ def simulated(experiment, runs):
     simulation = BlockSimulation(case, experiment.sensor, experiment.seed, 0, 0, runs)
     names = simulation.state_names
     start = simulation.initial_state
-    first_mode = getattr(simulation, "_supermode", np.full(runs, -1)).copy()
+    random = simulation.fixed is None
+    first_mode = simulation._runs.mode.copy() if random else np.full(runs, -1)
     truth, z = simulation.advance(slice(0, len(case.times_s) - 1))
     starts = [
         {n: start[e, b if start.shape[1] > 1 else 0] for e, n in enumerate(names)}

@@ -9,8 +9,10 @@ import pytest
 import reference
 from hybridtrack.chains import Bound, hard_bound, on_supermodes, pruned, soft_bound
 from hybridtrack.estimators import estimators
+from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Mode, ModeBank
-from hybridtrack.simulation import BLOCK_RUNS, BlockSimulation, Case, ChainTruth, Sensor
+from hybridtrack.sensors import Sensor
+from hybridtrack.simulation import BLOCK_RUNS, BlockSimulation, Case
 from models import figure_5_model, random_model, run_kernel
 
 MATRIX = np.array([[[0.7, 0.2, 0.1], [0.3, 0.6, 0.1], [0.05, 0.15, 0.8]]])

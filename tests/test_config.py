@@ -15,7 +15,8 @@ from hybridtrack.config import Experiment, dump, json_schema, load, shipped
 from hybridtrack.config.reader import read
 from hybridtrack.errors import UserError
 from hybridtrack.experiment import digest
-from hybridtrack.simulation import ChainTruth, FixedTruth
+from hybridtrack.jumps import ChainTruth
+from hybridtrack.simulation import FixedTruth
 from scenarios import (
     CHAIN,
     FIG5,
@@ -36,6 +37,7 @@ CLOCK = "clock: {step_s: 1, duration_s: 150}"
 SPAN = "step_s: 1, duration_s: 150"
 START = "start: {position_m: [0, 0], speed_kt: 480, heading_deg: 90}"
 NOISE = "position_std_m: 17.7}"
+ONE = "probability: 1, size_sigma: 60"
 SENSOR = "sensor: {position_std_m: 17.7}"
 CV = "CV: {motion: constant_velocity_zero_acceleration, acceleration_std_m_s2: 0.2}"
 CT = "CT: {motion: wiener_acceleration, acceleration_std_m_s2: 3.0}"
@@ -78,6 +80,10 @@ UNKNOWN_KEYS: list[tuple[Edit, str]] = [
     (("turn_rate_deg_s: 1.5", "»turn_rat_deg_s: 1.5"), "did you mean 'turn_rate_deg_s'?"),
     (("    metric: mode_accuracy", "    »metrics: mode_accuracy"), "did you mean 'metric'?"),
     (("after_switch_s: 10", "»after_swich_s: 10"), "did you mean 'after_switch_s'?"),
+    (
+        (NOISE, "position_std_m: 1, outliers: {probability: 1, »size: 60}}"),
+        "'size' is not a key here; the keys are from_s, probability, size_sigma, until_s",
+    ),
     (("  legs: ", "  »leggs: "), "'leggs' is not a key here; did you mean 'legs'?"),
     (("modes:\n", "modes: {}\n»moodes:\n"), "'moodes' is not a key here; did you mean 'modes'?"),
     # A known quantity in an unknown unit.
@@ -86,6 +92,10 @@ UNKNOWN_KEYS: list[tuple[Edit, str]] = [
         "'speed_mph' is not a key here; write speed_km_h, speed_kt or speed_m_s",
     ),
     (("turn_rate_deg_s: 1.5", "»turn_rate: 1.5"), "write turn_rate_deg_s or turn_rate_rad_s"),
+    (
+        (NOISE, "position_std_m: 1, outliers: {probability: 1, size_sigma: 60, »from: 9}}"),
+        "'from' is not a key here; write from_h, from_min or from_s",
+    ),
     (("step_s: 1,", "»step: 1,"), "'step' is not a key here; write step_h, step_min or step_s"),
     # The same quantity, or key, twice.
     (
@@ -117,6 +127,11 @@ WRONG_TYPES: list[tuple[Edit, str]] = [
     (
         (NOISE, "position_std_m: {CV: 3, »CT: [1, 2]}}"),
         "'position_std_m' of 'CT' is a list; it must be a number",
+    ),
+    ((NOISE, "position_std_m: 1, »outliers: 0.01}"), "'outliers' is 0.01; it must be a mapping"),
+    (
+        (NOISE, "position_std_m: 1, outliers: {»probability: x, size_sigma: 60}}"),
+        "'probability' is x; it must be a number",
     ),
     ((SPAN, "times_s: [0, 1, »x]"), "item 3 of 'times_s' is x; it must be a number"),
     ((SPAN, "»times_s: 150"), "'times_s' is 150; it must be a list"),
@@ -156,6 +171,18 @@ LIMITS: list[tuple[Edit, str]] = [
     (("turn_rate_deg_s: 1.5", "»turn_rate_deg_s: 2e-30"), "between 1e-30 and 1e+30 in SI units"),
     ((NOISE, "position_std_m: 1, »detection_probability: 1.5}"), "is 1.5; it must be at most 1"),
     ((NOISE, "position_std_m: 1, »detection_probability: 0}"), "is 0; it must be greater than 0"),
+    (
+        (NOISE, "position_std_m: 1, outliers: {»probability: 1.01, size_sigma: 60}}"),
+        "'probability' is 1.01; it must be at most 1",
+    ),
+    (
+        (NOISE, "position_std_m: 1, outliers: {»probability: -0.1, size_sigma: 60}}"),
+        "'probability' is -0.1; it must be at least 0",
+    ),
+    (
+        (NOISE, "position_std_m: 1, outliers: {probability: 1, »size_sigma: -60}}"),
+        "'size_sigma' is -60; it must be at least 0",
+    ),
     (("step_s: 1,", "»step_s: 0,"), "'step_s' is 0; it must be greater than 0"),
     (
         (CV, CV.replace(", accel", ", »accel").replace("0.2", "-0.2")),
@@ -227,6 +254,14 @@ MISSING: list[tuple[list[Edit], str]] = [
     ([TOP, (SENSOR, "")], "'sensor' is missing; add it"),
     ([TOP, (MATRIX, "")], "'transition_matrix' (or mean_sojourn_s, generator_per_s) is missing"),
     ([(SENSOR, "»sensor: {}")], "'position_std_m' (or position_std_km, position_std_ft, position_"),
+    (
+        [(NOISE, "position_std_m: 1, »outliers: {size_sigma: 60}}")],
+        "'probability' is missing in 'outliers'; add it",
+    ),
+    (
+        [(NOISE, "position_std_m: 1, »outliers: {probability: 0.01}}")],
+        "'size_sigma' is missing in 'outliers'; add it",
+    ),
     ([(CLOCK, "»clock: {step_s: 1}")], "needs 'step_s' and 'duration_s', or 'times_s' with every"),
     ([(RUNS, "»monte_carlo: {}")], "'runs' is missing in 'monte_carlo'; add it"),
     ([(FLOOR, "»RMIMM: {type: rmimm}")], "'residual_floor_m' (or residual_floor_km, "),
@@ -264,6 +299,27 @@ FIT: list[tuple[Edit, str]] = [
     (("step_s: 1, d", "step_s: 1e-9, »d"), "makes 150,000,000,000 steps of 'step_s', and at most"),
     ((SPAN, "times_s: [0, 1, »1]"), "'times_s' must increase, and 1 follows 1"),
     ((SPAN, "step_s: 1, »times_s: [0, 150]"), "remove 'step_s' and 'duration_s'"),
+    # outliers
+    (
+        (NOISE, f"position_std_m: 1, outliers: {{{ONE}, »from_s: 20, until_s: 10}}}}"),
+        "'from_s' is 20 s, after 'until_s' (10 s); swap them",
+    ),
+    (
+        (NOISE, f"position_std_m: 1, outliers: {{{ONE}, »from_min: 0.5, until_s: 10}}}}"),
+        "'from_s' is 30 s, after 'until_s' (10 s); swap them",
+    ),
+    (
+        (NOISE, f"position_std_m: 1, »outliers: {{{ONE}, from_s: 20.2, until_s: 20.4}}}}"),
+        "the span of 'outliers' holds no scan that could be one; move it (the nearest is at 20 s)",
+    ),
+    (
+        (NOISE, f"position_std_m: 1, »outliers: {{{ONE}, from_s: 200}}}}"),
+        "could be one; move it (the nearest is at 150 s)",
+    ),
+    (
+        (NOISE, f"position_std_m: 1, »outliers: {{{ONE}, until_s: 0}}}}"),  # k = 0 is no scan
+        "could be one; move it (the nearest is at 1 s)",
+    ),
     # legs
     (
         ("{until_s: 50,", "{»from_s: 20, until_s: 50,"),
@@ -408,6 +464,14 @@ FIGURE = "estimator: IMM\n    metric: position_rmse_m"
 
 # Mistakes whose place is at another line than the edit.
 ELSEWHERE: list[tuple[list[Edit], str]] = [
+    (
+        [
+            (NOISE, f"position_std_m: 1, »outliers: {{{ONE}, until_s: 2}}}}"),
+            (MEAN, "from_measurements: two_point"),
+            (SPREAD, ""),
+        ],
+        "could be one; move it (the nearest is at 3 s)",  # the first two make the start
+    ),
     (
         [(CLOCK, "clock: {times_s: [0, 1, 150]}"), (MATRIX, f"»{MATRIX}")],
         "these last 1 to 149 s; give 'mean_sojourn_s' or 'generator_per_s'",
@@ -996,6 +1060,23 @@ def test_noise_by_mode_by_axis_and_as_a_filter_believes_it(tmp_path: Path) -> No
     assert experiment.sensor.detection_probability == 0.9
     covariances = [np.diag(m.measurement_noise_covariance) for m in experiment.bank.modes]
     assert np.array(covariances).tolist() == [[4, 9], [16, 25]]
+
+
+def test_outliers_of_the_sensor(tmp_path: Path) -> None:
+    assert load(FIG5).sensor.outliers is None
+    often = load(FIG5, ["sensor.outliers={probability: 0.01, size_sigma: 60}"])
+    assert often.sensor.outliers == (0.01, 60.0, -np.inf, np.inf)
+    # Exactly one, by any unit of time.
+    for at in ("from_s: 120, until_s: 120", "from_min: 2, until_min: 2", "from_h: 0.0333333333333"):
+        text = FIG5.read_text().replace(NOISE, f"position_std_m: 1, outliers: {{{ONE}, {at}}}}}")
+        sensor = loaded(text, tmp_path).sensor
+        assert sensor.outliers is not None
+        assert sensor.outliers.from_s == pytest.approx(120.0, abs=1e-6)  # less than the slack
+        assert np.flatnonzero(sensor.may_be_outliers(np.arange(151.0)))[0] == 119
+    one = load(FIG5, [f"sensor.outliers={{{ONE}, from_s: 120, until_s: 120}}"])
+    assert one.sensor.may_be_outliers(np.arange(151.0)).sum() == 1
+    digests = {digest(e) for e in (load(FIG5), often, one)}
+    assert len(digests) == 3
 
 
 def test_the_ways_to_start(tmp_path: Path) -> None:

@@ -137,6 +137,23 @@ def test_recorded_measurements_are_run_once(tmp_path):
     assert scenario(tmp_path, noisy.replace("runs: 1", "runs: 2")).runs == 2
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("outliers", "{probability: 0, size_sigma: 1}"), ("detection_probability", "0.9")],
+)
+def test_a_sensor_leaves_recorded_measurements_as_they_are(tmp_path, key, value):
+    save(tmp_path, "scans.csv", rows("a", SCANS_S, metres, False))
+    text = ALONE.replace("std_m: 30}", f"std_m: 30, {key}: {value}}}")
+    says = rf":5:30: recorded measurements are taken as they are; remove '{key}' from the sensor$"
+    with pytest.raises(UserError, match=says):
+        scenario(tmp_path, text)
+    assert scenario(tmp_path, text.replace("0.9", "1"), "sensor.outliers=").runs == 1
+    noisy = text.replace("as: measurements", "as: truth, smooth_half_window_s: 20")
+    sensor = scenario(tmp_path, noisy).sensor
+    assert (sensor.outliers is not None) == (key == "outliers")
+    assert (sensor.detection_probability == 0.9) == (key == "detection_probability")
+
+
 @pytest.mark.parametrize("mean", ["truth", "drawn_about_truth"])
 def test_a_start_from_a_truth_that_nobody_knows_is_refused(tmp_path, mean):
     save(tmp_path, "scans.csv", rows("a", SCANS_S, metres, False))

@@ -49,7 +49,7 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
     for name, window in form.windows.items():
         windows.append(_window(name, window, form, truth_modes, document))
         _check_span(name, window, cases, document)
-    sensor = truths.sensor(form, truth_modes, initial.two_point, document)
+    sensor = truths.sensor(form, truth_modes, cases, initial.two_point, document)
     claims = tuple(
         built_claim(i, form, chosen, cases, sensor, document) for i in range(len(form.published))
     )
@@ -86,6 +86,12 @@ def _check_recorded(
             raise document.error(
                 ("monte_carlo", "runs"),
                 "recorded measurements are the same in every run; set 'runs' to 1",
+            )
+        if form.sensor.detection_probability < 1.0 or form.sensor.outliers is not None:
+            key = "detection_probability" if form.sensor.outliers is None else "outliers"
+            raise document.error(
+                ("sensor", key),
+                f"recorded measurements are taken as they are; remove '{key}' from the sensor",
             )
         assert isinstance(case.truth, FixedTruth)
         if initial.follows_truth and np.isnan(case.truth.state[0]).any():
@@ -195,13 +201,8 @@ def _check_span(name: str, window: WindowForm, cases: tuple[Case, ...], document
     """A window that some scan can lie in."""
     first = min(float(case.times_s[1]) for case in cases)
     last = max(float(case.times_s[-1]) for case in cases)
-    begin = -np.inf if window.from_s is None else window.from_s
-    end = np.inf if window.until_s is None else window.until_s
     path: Keys = ("windows", name)
-    if begin > end:
-        raise document.error(
-            (*path, "from_s"), f"'from_s' is {begin:g} s, after 'until_s' ({end:g} s); swap them"
-        )
+    begin, end = truths.span(window.from_s, window.until_s, document, path)
     if begin > last or end < first:
         raise document.error(
             path, f"window '{name}' holds no scan: they last from {first:g} to {last:g} s; move it"

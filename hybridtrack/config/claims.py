@@ -5,7 +5,8 @@ from hybridtrack.config.description import ChosenEstimator
 from hybridtrack.config.exact import exact_figure
 from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import ClaimForm, ScenarioForm
-from hybridtrack.simulation import Case, Sensor
+from hybridtrack.sensors import Sensor
+from hybridtrack.simulation import Case
 from hybridtrack.statistics import METRICS
 from hybridtrack.verdicts import Claim, printed_tolerance
 

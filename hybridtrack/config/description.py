@@ -6,7 +6,8 @@ import numpy as np
 
 from hybridtrack.estimators import Estimator
 from hybridtrack.models import Array, ModeBank
-from hybridtrack.simulation import Case, Sensor
+from hybridtrack.sensors import Sensor
+from hybridtrack.simulation import Case
 from hybridtrack.verdicts import Claim
 
 

@@ -10,8 +10,10 @@ from hybridtrack.chains import (
 from hybridtrack.config import checks
 from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import ClaimForm
+from hybridtrack.jumps import ChainTruth, truth_model
 from hybridtrack.models import ModeBank
-from hybridtrack.simulation import Case, ChainTruth, Sensor, step_lengths, truth_model
+from hybridtrack.sensors import Sensor
+from hybridtrack.simulation import Case, step_lengths
 
 OF_MODES = ("expected_steps_in_mode", "manoeuvring_index")
 

@@ -231,11 +231,25 @@ class TruthForm(Form):
     recording: RecordingForm | None = None
 
 
+class OutliersForm(Form):
+    """Errors of so many sigmas (Mahalanobis) in a random direction, added to the noise of a scan.
+
+    Each scan between `from_s` and `until_s` (all, if these aren't given) is one with the
+    probability given.
+    """
+
+    probability: Probability
+    size_sigma: NonNegative
+    from_s: float | None = None
+    until_s: float | None = None
+
+
 class SensorForm(Form):
     """What the truth's positions are measured with; per mode where a mapping of modes is given."""
 
     position_std_m: Positive | list[Positive] | dict[str, Positive]
     detection_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
+    outliers: OutliersForm | None = None
 
 
 class WindowForm(Form):

@@ -11,8 +11,10 @@ from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import FileForm, RecordingForm, ScenarioForm, TruthForm
 from hybridtrack.config.validate import as_written
 from hybridtrack.errors import UserError
+from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Array, ModeBank
-from hybridtrack.simulation import Case, ChainTruth, FixedTruth, Leg, Sensor, fly
+from hybridtrack.sensors import Outliers, Sensor
+from hybridtrack.simulation import Case, FixedTruth, Leg, fly
 
 MAX_STEPS = 10_000_000
 
@@ -195,7 +197,11 @@ def _legs(
 
 
 def sensor(
-    form: ScenarioForm, truth_modes: tuple[str, ...], two_point: bool, document: Document
+    form: ScenarioForm,
+    truth_modes: tuple[str, ...],
+    cases: tuple[Case, ...],
+    two_point: bool,
+    document: Document,
 ) -> Sensor:
     std = form.sensor.position_std_m
     path: Keys = ("sensor", "position_std_m")
@@ -208,4 +214,39 @@ def sensor(
         ]
     else:
         values = [checks.noise_covariance(std, form.dimensions, document, path)]
-    return Sensor(np.stack(values), form.sensor.detection_probability, 2 if two_point else 0)
+    given, outliers = form.sensor.outliers, None
+    if given is not None:
+        begin, end = span(given.from_s, given.until_s, document, ("sensor", "outliers"))
+        outliers = Outliers(given.probability, given.size_sigma, begin, end)
+    certain = 2 if two_point else 0
+    sensor = Sensor(np.stack(values), form.sensor.detection_probability, certain, outliers)
+    _check_outliers(sensor, cases, document)
+    return sensor
+
+
+def _check_outliers(sensor: Sensor, cases: tuple[Case, ...], document: Document) -> None:
+    """Some scan lies in the span of outliers, besides those that a start is made from."""
+    outliers = sensor.outliers
+    if outliers is None or any(sensor.may_be_outliers(case.times_s).any() for case in cases):
+        return
+    scans = np.concatenate([case.times_s[1 + sensor.certain_scans :] for case in cases])
+    outside = np.maximum(outliers.from_s - scans, scans - outliers.until_s)
+    raise document.error(
+        ("sensor", "outliers"),
+        "the span of 'outliers' holds no scan that could be one; move it (the nearest is at "
+        f"{scans[np.argmin(outside)]:.10g} s)",
+    )
+
+
+def span(
+    from_s: float | None, until_s: float | None, document: Document, path: Keys
+) -> tuple[float, float]:
+    """A span of time, open where an end isn't given; `path` leads to what has the two."""
+    begin = -np.inf if from_s is None else from_s
+    end = np.inf if until_s is None else until_s
+    if begin > end:
+        raise document.error(
+            as_written(document, (*path, "from_s")),
+            f"'from_s' is {begin:g} s, after 'until_s' ({end:g} s); swap them",
+        )
+    return begin, end
