@@ -2,17 +2,28 @@
 the filters on them against the filters that they become at their ends."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 
 import reference
-from hybridtrack.chains import Bound, hard_bound, on_supermodes, pruned, soft_bound
+from hybridtrack.chains import (
+    Bound,
+    expected_steps_in_mode,
+    expected_steps_to_end,
+    expected_transitions,
+    hard_bound,
+    on_supermodes,
+    pruned,
+    soft_bound,
+)
 from hybridtrack.estimators import estimators
 from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Mode, ModeBank
 from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import BLOCK_RUNS, BlockSimulation, Case
+from hybridtrack.vectors import WIDTH
 from models import figure_5_model, random_model, run_kernel
 
 MATRIX = np.array([[[0.7, 0.2, 0.1], [0.3, 0.6, 0.1], [0.05, 0.15, 0.8]]])
@@ -95,6 +106,196 @@ def test_what_cannot_be_reached_is_left_out():
     assert len(pruned(hard_bound(MATRIX, START, 4)).mode) == 15
     assert len(pruned(soft_bound(MATRIX, START, 0.0)).mode) == 6
     assert pruned(soft_bound(MATRIX, START, 1.0)).stage.tolist() == [0, 0, 0]
+
+
+# ---- the last mode ---------------------------------------------------------------------------
+
+
+def stays_for_ever(chain):
+    """By supermode, the probability that the mode never changes again: the limit of staying."""
+    same = chain.mode[:, np.newaxis] == chain.mode
+    staying = np.where(same, chain.transition_matrix[0], 0.0)
+    for _ in range(60):  # 2**60 steps
+        staying = staying @ staying
+    return staying.sum(axis=1)
+
+
+ABSORBING = np.array([[[0.7, 0.2, 0.1], [0.0, 1.0, 0.0], [0.05, 0.15, 0.8]]])
+
+
+@pytest.mark.parametrize("matrix", [MATRIX, ABSORBING], ids=["left", "one stays"])
+@pytest.mark.parametrize(
+    "bound",
+    [
+        Bound(),
+        Bound(continuation_probability=0.0),
+        Bound(continuation_probability=0.9),
+        Bound(continuation_probability=1.0),
+        Bound(most_transitions=0),
+        Bound(most_transitions=2),
+    ],
+)
+def test_how_likely_a_mode_is_the_last_one(bound, matrix):
+    chain = bound.supermodes(matrix, START)
+    np.testing.assert_allclose(chain.final_probability[0], stays_for_ever(chain), atol=1e-14)
+
+
+def test_a_leak_is_no_belief_that_modes_go_on():
+    with_leak, without = (soft_bound(MATRIX, START, 0.9, leak) for leak in (0.01, 0.0))
+    np.testing.assert_array_equal(with_leak.final_probability, without.final_probability)
+
+
+def test_the_last_mode_in_example_1_of_sigalov():
+    """q = (1 - p0)/(1 - p0 + p0 (1 - p_ii)) = 0.2033 where not ended."""
+    chain = soft_bound(np.array([[[0.92, 0.08], [0.08, 0.92]]]), np.array([1.0, 0.0]), 0.98)
+    q = 0.02 / (0.02 + 0.98 * 0.08)
+    np.testing.assert_allclose(chain.final_probability, [[q, q, 1.0, 1.0]], rtol=1e-14)
+    assert round(q, 4) == 0.2033
+
+
+def test_lemma_1_the_mode_alone_is_no_markov_chain():
+    """Sigalov 2011, eqs. 5-6: p12 = p21 = 1. Having stayed once, a mode stays for ever."""
+    swap, p0 = np.array([[[0.0, 1.0], [1.0, 0.0]]]), 0.6
+    chain = soft_bound(swap, np.array([1.0, 0.0]), p0)
+    found = sequence_probabilities(chain, 3)
+
+    def probability(*events):
+        return sum(p for modes, p in found.items() if all(modes[k] == m for k, m in events))
+
+    stayed = probability((3, 0), (2, 0), (1, 0)) / probability((2, 0), (1, 0))
+    assert stayed == pytest.approx(1.0, abs=1e-15)
+    alone = probability((3, 0), (2, 0)) / probability((2, 0))
+    # m1 at k = 2: ended at once (.4), or twice over (.36), and then it ends next with .4.
+    assert alone == pytest.approx((0.4 + 0.36 * 0.4) / 0.76, abs=1e-15)
+
+
+def test_expected_times_and_numbers_of_sigalovs_example():
+    even = np.array([[0.92, 0.08], [0.08, 0.92]])
+    assert expected_steps_to_end(0.98) == pytest.approx(50)
+    assert expected_steps_to_end(1.0) == math.inf
+    np.testing.assert_allclose(expected_steps_in_mode(even), 12.5)
+    assert expected_steps_in_mode(np.eye(2)).tolist() == [math.inf] * 2
+    chain = soft_bound(even[np.newaxis], np.array([1.0, 0.0]), 0.98)
+    assert expected_transitions(chain) == pytest.approx(0.98 * 0.08 * 50)
+
+
+@pytest.mark.parametrize(
+    ("chain", "known"),
+    [
+        (soft_bound(MATRIX, START, 0.9), None),
+        (hard_bound(MATRIX, START, 3), 3.0),
+        (hard_bound(ABSORBING, START, 3), None),
+        (hard_bound(MATRIX, START, 0), 0.0),
+        (soft_bound(MATRIX, START, 1.0), math.inf),
+        (Bound().supermodes(MATRIX, START), math.inf),
+    ],
+)
+def test_the_expected_number_of_transitions_is_the_sum_over_all_steps(chain, known):
+    found = expected_transitions(chain)
+    if known is None:
+        probability, known = chain.initial_probabilities, 0.0
+        leaves = chain.mode[:, np.newaxis] != chain.mode
+        for _ in range(5000):
+            known += float((probability @ np.where(leaves, chain.transition_matrix[0], 0)).sum())
+            probability = probability @ chain.transition_matrix[0]
+    assert found == pytest.approx(known, rel=1e-10)
+
+
+@pytest.mark.parametrize("name", ["sbf", "hbf"])
+def test_filters_tell_how_likely_the_mode_is_the_last_one(name):
+    """Against the slow reference on the supermodes, and with no scan at all against the chain."""
+    model = random_model(np.random.default_rng(5))._replace(
+        transition_matrix=MATRIX, initial_mode_probabilities=START
+    )
+    settings = {"continuation_probability": 0.9} if name == "sbf" else {"most_transitions": 2}
+    bounded, recursion = bound_filter(name, model, **settings)
+    z = scans(6, 20, scale=3.0)
+    found, _ = run_kernel(bounded, z, recursion)
+    final = bounded.final_probability[0]
+    for k, (_, _, mu, _) in enumerate(reference.bank(bounded, z[:, :, 0])):
+        assert found.final_mode_probability[k, 0] == pytest.approx(mu @ final, rel=ROUNDING)
+    estimator = estimators()[name]
+    chosen = estimator.settings(**settings)
+    at_work = estimator.begin(chosen, estimator.prepare(chosen, model), np.zeros((4, WIDTH)))
+    nothing = np.full((20, 2, WIDTH), np.nan)
+    prior = bounded.initial_mode_probabilities
+    for part in (nothing[:7], nothing[7:]):
+        estimates = at_work.advance(estimator.prepare(chosen, model), part)
+        for k in range(len(part)):
+            prior = prior @ bounded.transition_matrix[0]
+            expected = pytest.approx(prior @ final, rel=ROUNDING)
+            assert estimates.final_mode_prior[k, 0] == expected
+            assert estimates.final_mode_probability[k, 0] == expected
+
+
+def test_others_do_not_tell_of_a_last_mode():
+    found, _ = run_kernel(figure_5_model(), scans(1, 5))
+    assert found.final_mode_probability.size == 0
+
+
+# ---- the models of Sigalov 2011 --------------------------------------------------------------
+
+
+def sigalovs_model(wiener="wiener_acceleration"):
+    noise = np.array([[140.0**2]])
+    modes = (
+        Mode("m1", "constant_velocity_zero_acceleration", {"acceleration_std_m_s2": 0.3}, noise),
+        Mode("m2", wiener, {"acceleration_std_m_s2": 6.0}, noise),
+    )
+    matrix = np.array([[0.92, 0.08], [0.08, 0.92]])
+    bank = ModeBank(modes, ("x", "vx", "ax"), 1, matrix, None, np.array([1.0, 0.0]))
+    return bank.discretise(np.array([10.0]), np.zeros(3), np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize(
+    ("mode", "wiener", "position", "velocity"),
+    [
+        ("m1", "wiener_acceleration", 9385.954520, 23.36126351),
+        ("m2", "wiener_acceleration", 18819.63796, 1175.219531),
+        ("m2", "wiener_acceleration_as_printed", 19410.04112, 3179.324503),
+    ],
+)
+def test_steady_state_variances_of_sigalovs_kalman_filters(mode, wiener, position, velocity):
+    model = sigalovs_model(wiener).only(mode)
+    found, _ = run_kernel(model, np.zeros((400, 1, 1)))
+    # Packed lower triangle: (x, x), (x, vx), (vx, vx), ...
+    assert found.covariance[-1, 0, 0] == pytest.approx(position, rel=ASKED)
+    assert found.covariance[-1, 2, 0] == pytest.approx(velocity, rel=ASKED)
+
+
+FAMILY = {
+    "imm": {},
+    "sbf": {"continuation_probability": 0.98},
+    "hbf": {"most_transitions": 4},
+    "mmae": {},
+}
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_start_known_exactly_divides_nothing_by_nothing(name):
+    """m2 has probability 0 and all covariances are 0: unguarded mixing gives 0/0 at step 1."""
+    model, recursion = bound_filter(name, sigalovs_model(), **FAMILY[name])
+    found, _ = run_kernel(model, np.full((3, 1, 2), 50.0), recursion)
+    for array in found:
+        assert np.isfinite(array).all()
+    np.testing.assert_allclose(found.mode_probabilities.sum(axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [*FAMILY, "kalman", "genie"])
+def test_an_outlier_of_a_thousand_sigma_leaves_all_finite(name):
+    model, recursion = bound_filter(name, sigalovs_model(), **FAMILY.get(name, {}), **MODE[name])
+    z = 140.0 * np.random.default_rng(7).normal(size=(60, 1, 4))
+    z[20] += 140.0 * 1000.0 * np.array([1.0, -1.0, 1.0, -1.0])
+    known = np.zeros((60, 4)) if name == "genie" else None
+    found, _ = run_kernel(model, z, recursion, known=known)
+    for array in found:
+        assert np.isfinite(array).all()
+
+
+MODE = {name: {"mode": "m1"} if name == "kalman" else {} for name in (*FAMILY, "kalman", "genie")}
+
+
+# ---- as filters ------------------------------------------------------------------------------
 
 
 def bound_filter(name, model, **settings):

@@ -124,6 +124,30 @@ def test_known_input_is_held_over_the_step():
         assert_close(ours.input_effect[k], expected, rtol=1e-13)  # a few roundings of expm
 
 
+def test_the_wiener_acceleration_of_sigalov_as_printed():
+    """Eq. 16: Bar-Shalom's but for the last entry of Q, which is T and not 1; a covariance."""
+    steps = np.array([1.0, 4.0, 10.0])
+    printed = MOTION_MODELS["wiener_acceleration_as_printed"].discretise(
+        steps, 2, acceleration_std_m_s2=6.0
+    )
+    ours = motion("wiener_acceleration", "acceleration_std_m_s2", steps, strength=6.0)
+    np.testing.assert_array_equal(printed.state_transition, ours.state_transition)
+    change = printed.process_noise_covariance - ours.process_noise_covariance
+    expected = np.zeros_like(change)
+    for a in (2, 5):
+        expected[:, a, a] = 36.0 * (steps - 1.0)
+    np.testing.assert_allclose(change, expected, atol=1e-12 * 36 * 1e4 / 4)  # of Q's largest entry
+    smallest = np.linalg.eigvalsh(printed.process_noise_covariance)[:, 0]
+    assert (smallest > -1e-12 * 36 * 1e4 / 4).all()
+
+
+def test_q_as_printed_is_refused_where_it_is_no_covariance():
+    with pytest.raises(UserError, match=r"no covariance for steps below 1 s, and one lasts 0\.5 s"):
+        MOTION_MODELS["wiener_acceleration_as_printed"].discretise(
+            np.array([2.0, 0.5]), 1, acceleration_std_m_s2=6.0
+        )
+
+
 def test_discrete_wiener_acceleration_adds_its_increment_at_the_start_of_the_step():
     names = ("x", "vx", "ax", "y", "vy", "ay")
     ours = motion("wiener_acceleration", "acceleration_std_m_s2", strength=3.0)
