@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from hybridtrack.chains import Bound
 from hybridtrack.estimators import _bank, _layout
 from hybridtrack.estimators._bank import NO_KNOWN_MODES, Recursion
 from hybridtrack.estimators._layout import Array, Estimates
@@ -27,6 +28,10 @@ __all__ = [
 ]
 
 
+def _no_bound(settings: Any) -> Bound:
+    return Bound()
+
+
 class BankEstimator(NamedTuple):
     """A multiple-model filter: a change of the model, and the recursion's choices."""
 
@@ -37,6 +42,7 @@ class BankEstimator(NamedTuple):
     model: Callable[[JumpMarkovModel, Any], JumpMarkovModel]
     recursion: Callable[[Any], Recursion]
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
+    bound: Callable[[Any], Bound] = _no_bound  # that `model` puts on the bank's chain
 
     def is_told_modes(self, settings: Any) -> bool:
         """Whether it has to be given the true modes."""
