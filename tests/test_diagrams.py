@@ -17,7 +17,7 @@ from hybridtrack.figures import save
 from models import figure_5_model, scenario
 from scenarios import CHAIN
 
-NAMES = ("CV", "CA", "CT", "H")
+NAMES = ("CV", "CA", "CT", "H", "J")
 LONG = ("nonmaneuvering_flight_with_constant_velocity", "turn", "W" * 64)
 SOFT, LEAKING = Bound(continuation_probability=0.98), Bound(0.9, leak=0.00123)
 
@@ -67,12 +67,13 @@ SHOWN = {
     "hard, 2 modes": one_chain(2, Bound(most_transitions=2)),
     "hard, 2 modes, zigzag": one_chain(2, Bound(most_transitions=4), (1.0, 0.0)),
     "hard, 3 modes": one_chain(3, Bound(most_transitions=2)),
-    "hard, 4 modes": one_chain(4, Bound(most_transitions=1)),
+    "hard, 4 modes": one_chain(4, Bound(most_transitions=2)),
+    "plain, 5 modes": one_chain(5, Bound()),
     "plain, long names": one_chain(3, Bound(), names=LONG),
     "soft, long names": one_chain(3, SOFT, names=LONG),
 }
 # Colours tell whose label it is where many lines cross.
-FEW_CROSSINGS = [name for name in SHOWN if name not in ("hard, 3 modes", "hard, 4 modes")]
+FEW_CROSSINGS = [name for name in SHOWN if not name.startswith(("hard, 3", "hard, 4", "plain, 5"))]
 
 
 @functools.cache  # each is looked at by many tests
@@ -197,6 +198,18 @@ def test_no_text_covers_another_or_a_line_or_a_circle(name):
                 assert np.hypot(*(corners - centre).T).max() < 0.33, text
             else:
                 assert from_box(box, centre[np.newaxis]) > 0.31, text
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_no_line_meets_a_circle_on_its_way_or_another_ones_loop(name):
+    figure = drawn(name)
+    lines = {ends(figure, arrow): polyline(arrow) for arrow in arrows(figure)}
+    for pair, line in lines.items():
+        for s, centre in enumerate(circles(figure)):
+            assert s in pair or np.hypot(*(line - centre).T).min() > 0.4
+            loop = lines.get((s, s))
+            if loop is not None and pair != (s, s):
+                assert np.hypot(*np.moveaxis(line[:, None] - loop, -1, 0)).min() > 0.04
 
 
 @pytest.mark.parametrize("name", SHOWN)
