@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.chains import Supermodes
-
-Array = NDArray[np.float64]
+from hybridtrack.models import Array
 
 RADIUS = 0.31  # of the circles
 GAP = 0.045  # between a curve and its label

@@ -18,12 +18,12 @@ from matplotlib.patches import Circle, FancyArrowPatch
 from matplotlib.path import Path
 from matplotlib.textpath import TextPath
 
-from hybridtrack.arrows import RADIUS, Array, Arrow, lay_out, place_labels
+from hybridtrack.arrows import RADIUS, Arrow, lay_out, place_labels
 from hybridtrack.chains import Bound, Supermodes
 from hybridtrack.config import Experiment
 from hybridtrack.errors import UserError
 from hybridtrack.figures import COLOURS, DPI, WIDTH_IN, style
-from hybridtrack.models import ModeBank
+from hybridtrack.models import Array, ModeBank
 from hybridtrack.simulation import ChainTruth, step_lengths
 
 MOST_SUPERMODES, MOST_ARROWS = 40, 100  # what can still be read
@@ -57,9 +57,9 @@ def chains(experiment: Experiment) -> dict[str, Chain]:
     truth = experiment.cases[0].truth
     if isinstance(truth, ChainTruth):
         found["truth"] = _chain("the truth", truth.bank, truth.bound, experiment)
-    several = [c for c in experiment.estimators if len(c.bank.modes) > 1]
     own = {
-        c.label: _chain(c.label, c.bank, c.estimator.bound(c.settings), experiment) for c in several
+        c.label: _chain(c.label, c.bank, c.estimator.bound(c.settings), experiment)
+        for c in experiment.estimators
     }
     plain = _chain("the modes", experiment.bank, Bound(), experiment)
     shared = [label for label, chain in own.items() if _same(chain, plain)]
@@ -127,7 +127,7 @@ def short(probability: float) -> str:
 @functools.lru_cache  # the same few probabilities and names again and again
 def _size(text: str, points: float) -> Array:
     """Width and height of a text in inches, (2,)."""
-    lines = text.split("\n")
+    lines = text.replace("$", r"\$").split("\n")  # no mathematics
     width = max(TextPath((0, 0), line, size=points).get_extents().width for line in lines) / 72
     size = np.array([width, points * (LINE * (len(lines) - 1) + HEIGHT)])
     size.flags.writeable = False
@@ -202,7 +202,6 @@ def _draw_arrow(ax: Axes, arrow: Arrow, label: Array, mode: int) -> None:
             mutation_scale=11,
             color=_colour(mode),
             linewidth=1.0,
-            gid=f"{arrow.origin} -> {arrow.destination}",
         )
     )
     _write(ax, short(arrow.probability), label, LABEL_PT, color=_colour(mode, 0.7))
@@ -222,8 +221,8 @@ def _draw_edges(ax: Axes, chain: Chain, centres: Array, low: Array, high: Array)
             name = name if _symbol_pt(chain) else _wrapped(f"m{mode + 1}: {name}")
             place = np.array([x, high[1] + MARGIN])
             _write(ax, name, place, va="bottom")
-            half, height = _size(name, NAME_PT) * (0.5, 1.3)
-            corners += [place + (-half, 0.0), place + (half, height)]  # noqa: RUF005
+            size = _size(name, NAME_PT)
+            corners += [place + size * side for side in ((-0.5, 0.0), (0.5, 1.3))]
     if _has_stages(chain):
         for y, stage in dict(zip(centres[:, 1], chain.supermodes.stage, strict=True)).items():
             text = _stage(chain.bound, int(stage))
@@ -247,8 +246,9 @@ def _stage(bound: Bound, stage: int) -> str:
 
 def _caption(chain: Chain) -> str:
     mode, _, _, initial = chain.supermodes
-    starts = ", ".join(
-        f"{_symbol(chain, mode[s])} {short(initial[s])}" for s in np.flatnonzero(initial)
+    starts = ", ".join(  # no line ends between a mode and its probability
+        f"{_symbol(chain, mode[s])}\N{NO-BREAK SPACE}{short(initial[s])}"
+        for s in np.flatnonzero(initial)
     )
     return (
         f"Markov chain of {chain.owner}: probabilities of {chain.step}, in the colour of the mode "
@@ -260,7 +260,8 @@ def _frame(figure: Figure, ax: Axes, heading: str, corners: Array) -> None:
     """Title and caption at the top left, the diagram in the middle below them."""
     low, high = corners
     lines = heading.count("\n") + 1
-    wide = max(WIDTH_IN, high[0] - low[0] + 2 * MARGIN)
+    needed = max(high[0] - low[0], _size(heading, HEADING_PT)[0])
+    wide = max(WIDTH_IN, needed + 2 * MARGIN)
     left, bottom = (low[0] + high[0] - wide) / 2, low[1] - MARGIN
     top = high[1] + 2 * MARGIN + lines * LINE * HEADING_PT
     _write(ax, heading, np.array([left + 0.07, top - 0.07]), HEADING_PT, ha="left", va="top")

@@ -249,7 +249,15 @@ def test_a_double_ring_is_a_possible_start():
         np.testing.assert_array_equal(inner, circles(figure)[starts])
     heading = boxes(drawn("soft, 2 modes"))[-1][0].replace("\n", " ")
     assert heading.startswith("A title Markov chain of SBF: probabilities of a step of 10 s")
-    assert heading.endswith("double ring: possible at the start (CV 1)")
+    assert heading.endswith("double ring: possible at the start (CV\N{NO-BREAK SPACE}1)")
+
+
+def test_a_title_is_no_mathematics_and_fits_whatever_it_says():
+    title = r"$\nothing$ for $5 " + "W" * 150
+    figure = draw({"chain": SHOWN["plain, 2 modes"]}, title)["chain"]
+    heading, box = boxes(figure)[-1]
+    assert heading.startswith(r"$\nothing$ for $5 W")
+    assert figure.axes[0].get_xlim()[1] > box[1, 0]
 
 
 @pytest.mark.parametrize(
@@ -316,6 +324,15 @@ def test_a_bound_that_changes_nothing_is_the_modes(tmp_path):
     found = chains(scenario(tmp_path, never))
     assert list(found) == ["truth", "modes", "HBF"]
     assert found["modes"].owner == "the modes (IMM, MMAE, SBF)"
+
+
+def test_one_mode_that_may_end_is_a_chain_of_two(tmp_path):
+    one = UNEVEN.replace("  fast: {motion: constant_velocity, acceleration_std_m_s2: 9}\n", "")
+    one = one.replace("mean_sojourn_s: {slow: 10, fast: 4}\n", "")
+    one = one.replace("{type: imm}", "{type: sbf, continuation_probability: 0.9}")
+    found = chains(scenario(tmp_path, one))
+    assert list(found) == ["IMM"]
+    assert found["IMM"].supermodes.stage.tolist() == [0, 1]
 
 
 def test_a_filter_called_modes_keeps_its_picture(tmp_path):
