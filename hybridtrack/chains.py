@@ -33,6 +33,11 @@ class Bound(NamedTuple):
     leak: float = 0.0
     most_transitions: int | None = None
 
+    @property
+    def is_set(self) -> bool:
+        """Whether there is one."""
+        return self.continuation_probability is not None or self.most_transitions is not None
+
     def supermodes(self, transition_matrix: Array, initial_probabilities: Array) -> Supermodes:
         """The chain (n_times, n, n) and its start (n,) under this bound, pruned."""
         given = (transition_matrix, initial_probabilities)

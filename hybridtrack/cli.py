@@ -350,13 +350,50 @@ def validate(
         raise typer.Exit(2)
 
 
-@command("hybridtrack plot runs/rmimm_fig5-0123456789")
+@command(
+    "hybridtrack plot runs/rmimm_fig5-0123456789",
+    "hybridtrack plot --chain rmimm_fig5 --out pictures",
+)
 def plot(
-    run_dir: Annotated[Path, typer.Argument(help="A run folder, as `run` printed it.")],
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run folder, as `run` printed it.")
+    ] = None,
+    chain: Annotated[
+        str | None,
+        typer.Option(metavar="CONFIG", help="Draw this scenario's Markov chains instead."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="With --chain: folder instead of runs/NAME-chain.")
+    ] = None,
 ) -> None:
-    """Draw a run's figures again, from its folder alone."""
-    for path in draw_figures(run_dir):
+    """Draw a run's figures again, or a scenario's Markov chains.
+
+    A run's figures are drawn from its folder alone. --chain takes a scenario's file, or a shipped
+    one's name, and draws the state transition diagrams of its truth and estimators, whose modes may
+    be bounded in how often they change.
+    """
+    if run_dir is not None and chain is not None:
+        raise UserError(f"{run_dir} and --chain {chain} are two things to draw; give one of them")
+    if chain is not None:
+        paths = draw_chains(chain, out)
+    elif run_dir is None:
+        raise UserError("there is nothing to draw; give a run folder, or a scenario to --chain")
+    elif out is not None:
+        raise UserError(f"--out {out}: a run's figures go to its own folder; leave --out away")
+    else:
+        paths = draw_figures(run_dir)
+    for path in paths:
         print(path)
+
+
+def draw_chains(config: str, out: Path | None) -> list[Path]:
+    """Draw the state transition diagrams of a scenario's Markov chains."""
+    from hybridtrack import diagrams, figures
+    from hybridtrack.config import load
+
+    experiment = load(config)
+    drawn = diagrams.draw(diagrams.chains(experiment), experiment.title)
+    return figures.save(drawn, out or Path("runs") / f"{experiment.name}-chain")
 
 
 @command("hybridtrack list", "hybridtrack list motions", name="list")

@@ -117,7 +117,7 @@ def draw(
         reliability. With several cases the figures over time are drawn for each of the first six,
         and their names end in `-CASE`.
     """
-    with _style():
+    with style():
         looks = _looks(steps, tracks, information)
         figures = {"trajectory": _draw_trajectory(tracks, looks, information)}
         for case in split_cases(steps, information.title):
@@ -155,7 +155,7 @@ def _save_one(figure: Figure, path: Path) -> Path:
     canvas = figure.canvas
     assert isinstance(canvas, FigureCanvasAgg)
     try:
-        with _style():
+        with style():
             canvas.draw()  # type: ignore[no-untyped-call]
         pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
         image = Image.fromarray(pixels).convert("RGB")
@@ -167,7 +167,7 @@ def _save_one(figure: Figure, path: Path) -> Path:
 
 
 @contextmanager
-def _style() -> Iterator[None]:
+def style() -> Iterator[None]:
     """Matplotlib's defaults with our sizes, whatever the user's matplotlibrc says."""
     with matplotlib.style.context(["default", STYLE]):
         yield

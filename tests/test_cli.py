@@ -149,6 +149,28 @@ def test_plot_draws_the_same_figures_from_the_folder_alone(finished, tmp_path):
     assert figures == {p.name: p.read_bytes() for p in (folder / "figures").iterdir()}
 
 
+def test_plot_draws_the_chains_of_a_scenario_that_was_never_run(tmp_path):
+    bounded = ["  SBF: {type: sbf, continuation_probability: 0.98}"]
+    bounded += ["  HBF: {type: hbf, most_transitions: 2}"]
+    text = (CONFIGS / "rmimm_fig5.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(
+        text.replace("estimators:\n", "\n".join(["estimators:", *bounded, ""]), 1)
+    )
+    done = hybridtrack("plot", "--chain", "mine.yaml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    folder = Path("runs/rmimm_fig5-chain")
+    expected = [folder / f"{name}.png" for name in ("modes", "SBF", "HBF")]
+    assert done.stdout.splitlines() == list(map(str, expected))
+    assert {p.name for p in (tmp_path / folder).iterdir()} == {p.name for p in expected}
+    again = hybridtrack("plot", "--chain", "mine.yaml", "--out", "here", cwd=tmp_path)
+    assert again.stdout.splitlines() == ["here/modes.png", "here/SBF.png", "here/HBF.png"]
+    for path in expected:
+        bytes_of_png = (tmp_path / path).read_bytes()
+        assert bytes_of_png.startswith(b"\x89PNG")
+        assert bytes_of_png == (tmp_path / "here" / path.name).read_bytes()
+
+
 def test_resolved_configuration_runs_again_to_the_same_digest(finished, tmp_path):
     cwd, first = finished
     folder = cwd / first.stdout.splitlines()[-1]
@@ -185,6 +207,11 @@ def test_out_names_the_folder_and_other_runs_are_safe_in_it(tmp_path):
         (["run", "rmimm_fig5", "--set", "foo"], ["foo"]),
         (["plot", "."], ["run folder"]),
         (["plot", "nowhere"], ["nowhere"]),
+        (["plot"], ["run folder", "--chain"]),
+        (["plot", "nowhere", "--chain", "rmimm_fig5"], ["nowhere", "--chain rmimm_fig5", "one"]),
+        (["plot", "nowhere", "--out", "here"], ["--out here", "leave --out away"]),
+        (["plot", "--chain", "rmimm_fig6"], ["rmimm_fig6", "rmimm_fig5"]),
+        (["plot", "--chain", "rmimm_fig5", "--out", "/dev/null/x"], ["/dev/null/x"]),
         (["ledger", "nowhere"], ["nowhere"]),
         (["init", "a b"], ["a b", "letters"]),
         (["list", "foo"], ["foo", "estimators"]),

@@ -114,7 +114,7 @@ def _check_metric(
         if one.label == label:
             several = len(one.bank.modes) > 1
             known = ("position_", "velocity_", *(("mode_", "true_", "likelihood_") * several))
-            if one.estimator.tells_final_mode(one.settings):
+            if one.estimator.bound(one.settings).is_set:
                 known = (*known, "final_mode_")
     if not metric.startswith(known):
         there = ", ".join(name for name in METRICS if name.startswith(known))

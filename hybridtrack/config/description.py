@@ -67,5 +67,5 @@ class Experiment(NamedTuple):
     @property
     def foresees(self) -> bool:
         """Whether an estimator tells how likely the mode now is the last, and the truth knows."""
-        tell = any(chosen.estimator.tells_final_mode(chosen.settings) for chosen in self.estimators)
-        return tell and bool(self.truth_modes)
+        bounds = [chosen.estimator.bound(chosen.settings) for chosen in self.estimators]
+        return any(bound.is_set for bound in bounds) and bool(self.truth_modes)

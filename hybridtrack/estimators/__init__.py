@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from hybridtrack.chains import Bound
 from hybridtrack.estimators import _bank, _layout
 from hybridtrack.estimators._bank import NO_KNOWN_MODES, Recursion
 from hybridtrack.estimators._layout import Array, Estimates
@@ -77,8 +78,12 @@ class Estimator(Protocol):
         """Whether it has to be given the true modes."""
         ...
 
-    def tells_final_mode(self, settings: Any) -> bool:
-        """Whether it estimates how likely the mode now is the last one."""
+    @property
+    def bound(self) -> Callable[[Any], Bound]:
+        """How its chain is bounded, by its settings.
+
+        Under a bound its model says how likely the mode now is the last one, and so it estimates.
+        """
         ...
 
     def prepare(self, settings: Any, model: JumpMarkovModel) -> Any:
@@ -88,6 +93,10 @@ class Estimator(Protocol):
     def begin(self, settings: Any, prepared: Any, initial_mean: Array) -> AtWork:
         """Start on a block: `prepared` for its first span, initial_mean (n_x, lanes)."""
         ...
+
+
+def _no_bound(settings: Any) -> Bound:
+    return Bound()
 
 
 class BankEstimator(NamedTuple):
@@ -100,15 +109,11 @@ class BankEstimator(NamedTuple):
     model: Callable[[JumpMarkovModel, Any], JumpMarkovModel]
     recursion: Callable[[Any], Recursion]
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
-    is_bounded: bool = False  # whether its chain comes to an end, and the model says how likely
+    bound: Callable[[Any], Bound] = _no_bound  # that `model` puts on the bank's chain
 
     def is_told_modes(self, settings: Any) -> bool:
         """Whether it has to be given the true modes."""
         return self.recursion(settings).interaction == _bank.INHERIT
-
-    def tells_final_mode(self, settings: Any) -> bool:
-        """Whether it estimates how likely the mode now is the last one."""
-        return self.is_bounded
 
     def prepare(self, settings: Any, model: JumpMarkovModel) -> "Prepared":
         """The model on its own chain, as it is and as the kernel wants it."""

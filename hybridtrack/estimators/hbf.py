@@ -19,11 +19,13 @@ class Settings(NamedTuple):
     most_transitions: int
 
 
+def _bound(settings: Settings) -> Bound:
+    return Bound(most_transitions=settings.most_transitions)
+
+
 def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    bound = Bound(most_transitions=settings.most_transitions)
-    return on_supermodes(
-        model, bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
-    )
+    chain = (model.transition_matrix, model.initial_mode_probabilities)
+    return on_supermodes(model, _bound(settings).supermodes(*chain))
 
 
 def _recursion(settings: Settings) -> Recursion:
@@ -38,5 +40,5 @@ ESTIMATOR = BankEstimator(
     model=_model,
     recursion=_recursion,
     limits={"most_transitions": (0.0, 100.0)},
-    is_bounded=True,
+    bound=_bound,
 )

@@ -20,11 +20,13 @@ class Settings(NamedTuple):
     leak: float = 0.0
 
 
+def _bound(settings: Settings) -> Bound:
+    return Bound(continuation_probability=settings.continuation_probability, leak=settings.leak)
+
+
 def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    bound = Bound(continuation_probability=settings.continuation_probability, leak=settings.leak)
-    return on_supermodes(
-        model, bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
-    )
+    chain = (model.transition_matrix, model.initial_mode_probabilities)
+    return on_supermodes(model, _bound(settings).supermodes(*chain))
 
 
 def _recursion(settings: Settings) -> Recursion:
@@ -39,5 +41,5 @@ ESTIMATOR = BankEstimator(
     model=_model,
     recursion=_recursion,
     limits={"continuation_probability": (0.0, 1.0), "leak": (0.0, 1.0)},
-    is_bounded=True,
+    bound=_bound,
 )
