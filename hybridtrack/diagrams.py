@@ -22,9 +22,9 @@ from hybridtrack.arrows import RADIUS, Arrow, lay_out, place_labels
 from hybridtrack.chains import Bound, Supermodes
 from hybridtrack.config import Experiment
 from hybridtrack.errors import UserError
-from hybridtrack.figures import COLOURS, DPI, WIDTH_IN, style
 from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Array, ModeBank
+from hybridtrack.page import COLOURS, DPI, WIDTH_IN, style
 from hybridtrack.simulation import step_lengths
 
 MOST_SUPERMODES, MOST_ARROWS = 40, 100  # what can still be read

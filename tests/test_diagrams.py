@@ -355,7 +355,9 @@ def test_a_chain_that_is_too_large_names_its_filter_and_the_remedy(tmp_path):
     large = BOUNDED.replace("most_transitions: 3", "most_transitions: 20")
     with pytest.raises(UserError, match=r"HBF has 42 supermodes .* at most 40 .* a smaller most_t"):
         chains(scenario(tmp_path, large))
-    assert "HBF" in chains(scenario(tmp_path, large.replace("most_transitions: 20", "most_transitions: 19")))
+    assert "HBF" in chains(
+        scenario(tmp_path, large.replace("most_transitions: 20", "most_transitions: 19"))
+    )
 
 
 def test_one_filter_alone_has_no_chain(tmp_path):

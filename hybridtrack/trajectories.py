@@ -1,0 +1,97 @@
+"""One run in the plane, or its position over time."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hybridtrack.curves import Array, Table, read_paths
+from hybridtrack.page import (
+    TRUTH_COLOUR,
+    Looks,
+    RunInformation,
+    finish,
+    panels,
+    plain_numbers,
+    plot_line,
+)
+
+HALVES = np.array([-0.5, 0.5])
+
+
+def draw_trajectory(tracks: Table, looks: Looks, information: RunInformation) -> Figure | None:
+    """One run in the plane (east, north), or its position over time if it has one dimension."""
+    if not len(tracks["case"]):
+        return None
+    case, run = (np.asarray(tracks[column])[0] for column in ("case", "run"))
+    paths, plane = read_paths(tracks, case, run)
+    if not paths:
+        return None
+    figure, (ax,) = panels(1, 1, 3.2)
+    _plot_paths(ax, paths, looks)
+    leaving = _frame_trajectory(figure, ax, paths, plane)
+    where = f"case {case}, " if len(set(tracks["case"])) > 1 else ""
+    finish(figure, information.title, f"Trajectory, {where}run {run}", leaving)
+    return figure
+
+
+def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> None:
+    if "measurement" in paths:
+        label, colour, _ = looks["raw"]
+        # Crosses wider than the truth, which would hide dots; too many would hide the lines.
+        above = 3 if paths["measurement"].shape[1] <= 500 else 1
+        cross: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0.5, "zorder": above}
+        ax.plot(*paths["measurement"], "+", color=colour, label=label, **cross)
+    if "truth" in paths:
+        truth = paths["truth"]
+        first = truth[:, np.isfinite(truth).all(axis=0)][:, 0]
+        ax.plot(*truth, color=TRUTH_COLOUR, linewidth=2.2, label="truth")
+        ring: dict[str, Any] = {"color": TRUTH_COLOUR, "markerfacecolor": "white", "zorder": 5}
+        ax.plot(*first, "o", label="first scan", **ring)
+    for name, look in looks.items():
+        if name in paths:
+            plot_line(ax, paths[name][0], paths[name][1], look)
+
+
+def _frame_trajectory(
+    figure: Figure, ax: Axes, paths: Mapping[str, Array], plane: bool
+) -> list[str]:
+    """Fit axes and unit to the flight and the estimates; returns the estimates that leave.
+
+    An estimate may widen the frame by half a span of the flight on each side and no more, so that
+    a filter that runs away doesn't shrink the flight to a dot.
+    """
+    flight = [paths[name] for name in ("truth", "measurement") if name in paths]
+    flown, everything = _extent(flight or paths.values()), _extent(paths.values())
+    span = np.ptp(flown, axis=1)
+    margin = 0.5 * (np.full(2, span.max()) if plane else span)
+    margin[margin == 0] = np.inf
+    low = np.maximum(everything[:, 0], flown[:, 0] - margin)
+    high = np.minimum(everything[:, 1], flown[:, 1] + margin)
+    size = 1.08 * np.where(high > low, high - low, 1.0)
+    unit, metres = ("km", 1e3) if size[0 if plane else 1 :].max() > 10e3 else ("m", 1.0)
+    formatter = plain_numbers(metres)
+    ax.yaxis.set_major_formatter(formatter)
+    ax.set_ylabel(f"y, north ({unit})" if plane else f"position x ({unit})")
+    ax.set_xlabel(f"x, east ({unit})" if plane else "time (s)")
+    if plane:
+        # Even a straight flight gets a readable shape.
+        size = np.maximum(size, [1.3 * size[1], 0.3 * size[0]])
+        figure.set_figheight(0.5 + 6.3 * size[1] / size[0])
+        ax.xaxis.set_major_formatter(formatter)
+        ax.set_aspect("equal")
+    middle = (low + high) / 2
+    ax.set(xlim=middle[0] + size[0] * HALVES, ylim=middle[1] + size[1] * HALVES)
+    return [
+        name
+        for name, path in paths.items()
+        if (np.abs(path - middle[:, None]) > size[:, None] / 2).any()
+    ]
+
+
+def _extent(paths: Iterable[Array]) -> Array:
+    """(2, 2): the least and the largest of both rows."""
+    joined = np.concatenate(list(paths), axis=1)
+    return np.stack([np.nanmin(joined, axis=1), np.nanmax(joined, axis=1)], axis=1)
