@@ -265,7 +265,7 @@ def draw_figures(folder: Path) -> list[Path]:
     steps, tracks, reliability = (
         results.read_columns(folder, name) for name in ("steps", "tracks", "reliability")
     )
-    drawn = figures.draw(steps, tracks, reliability, information)
+    drawn = figures.draw(steps, tracks, information, reliability)
     paths = figures.save(drawn, folder / "figures")
     noted = manifest | {"figures": [path.name for path in paths]}
     if noted != manifest and results.read_manifest(folder) == manifest:  # nobody went on meanwhile

@@ -30,16 +30,16 @@ __all__ = ["RunInformation", "draw", "save"]
 
 
 def draw(
-    steps: Table, tracks: Table, reliability: Table, information: RunInformation
+    steps: Table, tracks: Table, information: RunInformation, reliability: Table | None = None
 ) -> dict[str, Figure]:
     """Draw what the tables of a run folder hold; a figure whose data are absent is left out.
 
     Args:
         steps: long, columns case, estimator, step, time_s, metric, value, standard_error.
         tracks: long, columns case, run, estimator, step, time_s, quantity, value (SI units).
-        reliability: columns estimator, from_probability, to_probability, share_of_steps,
-            mean_probability, frequency, standard_error.
         information: title, number of runs, the order of estimators and modes, what is compared.
+        reliability: columns estimator, from_probability, to_probability, share_of_steps,
+            mean_probability, frequency, standard_error; if there are any.
 
     Returns:
         Figures by name: trajectory (of the first run in `tracks`), position_error,
@@ -59,7 +59,8 @@ def draw(
                 figures[metric + case.suffix] = draw_modes(case, metric, looks, information)
             name = "final_mode_probability"
             figures[name + case.suffix] = draw_final_mode(case, looks, information)
-        figures["reliability"] = _draw_reliability(reliability, looks, information)
+        if reliability is not None:
+            figures["reliability"] = _draw_reliability(reliability, looks, information)
     return {name: figure for name, figure in figures.items() if figure is not None}
 
 

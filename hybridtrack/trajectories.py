@@ -29,9 +29,14 @@ def draw_trajectory(tracks: Table, looks: Looks, information: RunInformation) ->
     paths, plane = read_paths(tracks, case, run)
     if not paths:
         return None
-    figure, (ax,) = panels(1, 1, 3.2)
+    errors = not plane and "truth" in paths
+    rows, height, heights = (2, 4.2, (1, 1)) if errors else (1, 3.2, (1,))
+    figure, (ax, *below) = panels(rows, 1, height, sharey=False, heights=heights)
     _plot_paths(ax, paths, looks)
     leaving = _frame_trajectory(figure, ax, paths, plane)
+    if errors:
+        leaving += [n for n in _plot_errors(below[0], paths, looks) if n not in leaving]
+        ax.set_xlabel("")
     where = f"case {case}, " if len(set(tracks["case"])) > 1 else ""
     finish(figure, information.title, f"Trajectory, {where}run {run}", leaving)
     return figure
@@ -53,6 +58,26 @@ def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> None:
     for name, look in looks.items():
         if name in paths:
             plot_line(ax, paths[name][0], paths[name][1], look)
+
+
+def _plot_errors(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> list[str]:
+    """How far off positions are, where the flight is too long to see it; returns who leaves."""
+    time, truth = paths["truth"]
+    off = {name: path[1] - truth for name, path in paths.items() if name != "truth"}
+    if "measurement" in off:
+        style: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0.5}
+        ax.plot(time, off["measurement"], "+", color=looks["raw"].colour, **style)
+    for name, look in looks.items():
+        if name in off:
+            plot_line(ax, time, off[name], look)
+    sizes = {name: float(np.nanquantile(np.abs(e), 0.95)) for name, e in off.items()}
+    limit = 1.6 * sizes.get("measurement", min(sizes.values(), default=1.0))
+    ax.axhline(0.0, color=TRUTH_COLOUR, linewidth=0.7, zorder=0.5)
+    ax.set(xlabel="time (s)", ylabel="position error (m)")
+    if limit > 0:
+        ax.set_ylim(-limit, limit)
+    ax.yaxis.set_major_formatter(plain_numbers())
+    return [name for name, size in sizes.items() if size > limit > 0]
 
 
 def _frame_trajectory(

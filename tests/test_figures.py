@@ -277,9 +277,108 @@ def test_a_target_at_rest_frames_its_estimates():
 def test_one_dimension_is_position_over_time():
     steps, tracks, information = seven_legs()
     tracks = tracks[tracks["quantity"] == "x"]
-    ax = draw(steps, tracks, information)["trajectory"].axes[0]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "position x (km)")
+    ax, below = draw(steps, tracks, information)["trajectory"].axes
+    assert (below.get_xlabel(), ax.get_ylabel()) == ("time (s)", "position x (km)")
     np.testing.assert_array_equal(line(ax, "truth").get_xdata(), np.arange(1, 151))
+
+
+def test_in_one_dimension_errors_are_drawn_below():
+    steps, tracks, information = seven_legs()
+    tracks = tracks[tracks["quantity"] == "x"]
+    figure = draw(steps, tracks, information)["trajectory"]
+    below = figure.axes[1]
+    assert (below.get_xlabel(), below.get_ylabel()) == ("time (s)", "position error (m)")
+    value = {name: rows["value"].to_numpy() for name, rows in tracks.groupby("estimator")}
+    drawn = line(below, "IMM").get_ydata()
+    np.testing.assert_allclose(drawn, value["IMM"] - value["truth"], atol=1e-9)  # of km
+    # The frame is for what is as good as the measurements: KF_CV is 900 m off in turns.
+    assert "leaves the frame: KF_CV" in figure.get_suptitle()
+    assert max(below.get_ylim()) < 200
+    assert_nothing_hidden(figure)
+
+
+def with_ratios(estimators=("SBF", "IMM", "KF")):
+    """Mean square errors and their ratios to a genie's; KF is hopeless."""
+    t = np.arange(1.0, 101.0)
+    steps = [rows(t, "genie position_mse_m2", 100.0, standard_error=1.0)]
+    for name, factor in zip(estimators, (1.02, 1.07, 5000.0), strict=True):
+        start = 1 + (factor - 1) * (1 + 4 * (t < 3))
+        for kind, unit in (("position", "m2"), ("velocity", "m2_s2")):
+            steps.append(rows(t, f"{name} {kind}_mse_{unit}", 100 * start, standard_error=1.0))
+            steps.append(rows(t, f"{name} {kind}_mse_ratio", start, standard_error=0.003))
+    _, tracks, _ = seven_legs()
+    names = ("genie", *estimators)
+    information = RunInformation("Ratios", 20_000, names, (), error="mse", compare_with="genie")
+    return pd.concat(steps), tracks, information
+
+
+def test_squared_errors_are_drawn_where_the_scenario_asks_and_a_hopeless_filter_is_named():
+    figure = draw(*with_ratios())["position_error"]
+    (ax,) = figure.axes
+    assert ax.get_ylabel() == "position mean square error (m²)"
+    assert "leaves the frame: KF" in figure.get_suptitle()
+    assert "KF" not in [one.get_label() for one in ax.lines]
+    assert (ax.get_yscale(), max(ax.get_ylim()) < 200) == ("linear", True)
+
+
+def test_ratios_to_one_estimator_make_small_differences_visible():
+    figure = draw(*with_ratios())["error_ratio"]
+    assert "genie's, over the same 20,000 runs" in figure.get_suptitle()
+    for ax, kind in zip(figure.axes, ("position", "velocity"), strict=True):
+        assert ax.get_ylabel() == f"{kind} error ratio"
+        low, high = ax.get_ylim()
+        assert low < 1.0 < 1.07 < high < 1.4
+        np.testing.assert_allclose(line(ax, "SBF").get_ydata()[5:], 1.02)
+        assert "KF" not in [one.get_label() for one in ax.lines]
+    assert_nothing_hidden(figure)
+
+
+def test_without_a_reference_there_are_no_ratios():
+    steps, tracks, information = with_ratios()
+    assert "error_ratio" not in draw(steps, tracks, information._replace(compare_with=None))
+
+
+RELIABILITY = pd.DataFrame(
+    {
+        "estimator": ["SBF"] * 4,
+        "from_probability": [0.0, 0.25, 0.5, 0.75],
+        "to_probability": [0.25, 0.5, 0.75, 1.0],
+        "share_of_steps": [0.1, 0.0, 0.3, 0.6],
+        "mean_probability": [0.2, np.nan, 0.6, 0.9],
+        "frequency": [0.15, np.nan, 0.62, 0.95],
+        "standard_error": [0.01, np.nan, 0.02, 0.01],
+    }
+)
+
+
+def test_reliability_and_the_probability_of_a_last_mode():
+    steps, tracks, information = with_ratios()
+    t = np.arange(1.0, 101.0)
+    name = "final_mode_probability"
+    steps = pd.concat(
+        [
+            steps,
+            rows(t, f"SBF {name}", t / 100, standard_error=0.01),
+            rows(t, "SBF final_mode_prior", t / 200, standard_error=0.0),
+            rows(t, f"truth {name}", t / 150, standard_error=0.01),
+        ]
+    )
+    figures = draw(steps, tracks, information, RELIABILITY)
+    (ax,) = figures[name].axes
+    for label, values in (
+        ("SBF", t / 100),
+        ("SBF, before any scan", t / 200),
+        ("truth: share of runs", t / 150),
+    ):
+        np.testing.assert_array_equal(line(ax, label).get_ydata(), values)
+    above, below = figures["reliability"].axes
+    (drawn,) = above.containers
+    x, y = drawn.lines[0].get_data()
+    np.testing.assert_array_equal(x, RELIABILITY["mean_probability"])
+    np.testing.assert_array_equal(y, RELIABILITY["frequency"])
+    assert [bar.get_height() for bar in below.patches] == RELIABILITY["share_of_steps"].tolist()
+    for drawn in (figures[name], figures["reliability"]):
+        assert_nothing_hidden(drawn)
 
 
 def test_the_first_run_of_the_first_case_is_drawn():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hybridtrack.estimators import Estimates
-from hybridtrack.scoring import Names, all_below, as_measured, blank_sheet
+from hybridtrack.scoring import Given, Names, all_below, as_measured, blank_sheet
 from hybridtrack.simulation import Scans, TruthSpan
 from hybridtrack.statistics import POSITION, POSITION_AT_SCANS, QUANTITIES
-from hybridtrack.tallies import Tally, Totals, add_to_step
+from hybridtrack.tallies import BINS, DIFFERENCE, Tally, Totals, add_to_step
 
 ROUNDING = 1e-12  # relative: some 1e2 operations of 1e-16, a margin of 100
 
@@ -35,6 +35,17 @@ def span(rng, *, n_modes=2, steps=6, lanes=5, truth_lanes=None, states=6, likeli
         covariance=np.empty((0, 0, lanes)),
     )
     return Scans(truth, rng.normal(size=(steps, 2, lanes))), estimates
+
+
+def foreseen(scans, estimates, rng):
+    """The same with the truth's last mode and what an estimator and its chain say of it."""
+    final = (rng.random(scans.truth.mode.shape) < 0.5).astype(float)
+    steps, _, lanes = estimates.mean.shape
+    told = {
+        "final_mode_probability": rng.random((steps, lanes)),
+        "final_mode_prior": rng.random((steps, 1)),
+    }
+    return scans._replace(truth=scans.truth._replace(final=final)), estimates._replace(**told)
 
 
 def slow_scores(scans, estimates, names):
@@ -70,6 +81,14 @@ def slow_scores(scans, estimates, names):
                 half = sum((v - (name == mode)) ** 2 for name, v in p.items()) / 2
                 note("mode_brier", k, run, half)
                 note("true_mode_probability", k, run, p[mode])
+            if len(estimates.final_mode_probability) and len(scans.truth.final):
+                final = scans.truth.final[k, here]
+                p, prior = (
+                    estimates.final_mode_probability[k, run],
+                    estimates.final_mode_prior[k, 0],
+                )
+                note("final_mode_brier", k, run, (p - final) ** 2)
+                note("final_mode_prior_brier", k, run, (prior - final) ** 2)
             if (
                 len(estimates.mode_likelihoods)
                 and not np.isnan(scans.measurements[k, :, run]).any()
@@ -90,9 +109,13 @@ def tallied(scans, estimates, names, **options):
     """
     steps, _, lanes = estimates.mean.shape
     sheet = options.pop("sheet", None) or blank_sheet(steps, lanes)
-    likelihoods = len(estimates.mode_likelihoods) > 0
+    given = Given(
+        likelihoods=len(estimates.mode_likelihoods) > 0,
+        final=len(estimates.final_mode_probability) > 0,
+        **options,
+    )
     windows = tuple(map(str, range(steps)))
-    tally = Tally(names, steps, windows, sheet, lanes, likelihoods=likelihoods, **options)
+    tally = Tally(names, steps, windows, sheet, lanes, given)
     tally.add(0, scans, np.eye(steps, dtype=bool)[..., np.newaxis], estimates)
     found = {}
     for (window, quantity), (sums, numbers) in tally.sums():
@@ -285,9 +308,75 @@ def test_an_advantage_is_kept_or_not_or_unknown():
 
 
 def test_every_quantity_can_be_tallied():
-    scans, estimates = span(np.random.default_rng(9))
+    rng = np.random.default_rng(9)
+    scans, estimates = foreseen(*span(rng), rng)
     names = Names(TRUTH_STATES, ("a", "b"), SIX_STATES, ("a", "b"))
     assert set(tallied(scans, estimates, names, leads=True)) == set(QUANTITIES)
+
+
+@pytest.mark.parametrize("truth_lanes", [None, 1])
+def test_the_last_mode_is_scored(truth_lanes):
+    rng = np.random.default_rng(12)
+    scans, estimates = foreseen(*span(rng, truth_lanes=truth_lanes), rng)
+    names = Names(TRUTH_STATES, ("a", "b"), SIX_STATES, ("a", "b"))
+    assert_scores(scans, estimates, names)
+    # Of a truth without modes nothing is known, of an estimator that tells nothing neither.
+    without = names._replace(truth_modes=())
+    assert "final_mode_brier" not in tallied(scans, estimates, without)
+    silent = estimates._replace(**{name: np.zeros((0, 1)) for name in TOLD})
+    assert "final_mode_brier" not in tallied(scans, silent, names)
+
+
+TOLD = ("final_mode_probability", "final_mode_prior")
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_probabilities_of_the_last_mode_are_binned_in_the_first_window(wide):
+    rng = np.random.default_rng(13)
+    steps, lanes, runs = 40, 8, 5
+    scans, estimates = foreseen(*span(rng, steps=steps, lanes=lanes), rng)
+    estimates.final_mode_probability[3, 2] = np.nan
+    estimates.final_mode_probability[4, :3] = (0.0, 1.0, 0.3)
+    names = Names(TRUTH_STATES, ("a", "b"), SIX_STATES, ("a", "b"))
+    held = rng.random((steps, 2, lanes if wide else 1)) < 0.7
+    tally = Tally(names, steps, ("a", "b"), blank_sheet(steps, lanes), runs, Given(final=True))
+    tally.add(0, scans, held, estimates)
+    expected = np.zeros((3, BINS, runs))
+    for k in range(steps):
+        for run in range(runs):
+            p, final = estimates.final_mode_probability[k, run], scans.truth.final[k, run]
+            if held[k, 0, run if wide else 0] and not math.isnan(p):
+                i = min(int(p * BINS), BINS - 1)
+                expected[:, i, run] += (1.0, p, final)
+    np.testing.assert_allclose(tally.final_bins, expected.reshape(-1, runs), ROUNDING)
+    assert expected[0].sum() > 0
+
+
+def test_errors_are_held_against_the_leading_ones_run_by_run():
+    rng = np.random.default_rng(14)
+    (scans, ours), (_, theirs) = span(rng, truth_lanes=1), span(rng)
+    ours.mean[2, 0, 1] = np.nan
+    names = Names(TRUTH_STATES, (), SIX_STATES, ("a",))
+    sheet, steps = blank_sheet(*ours.mean.shape[::2]), len(ours.mean)
+    held = np.ones((steps, 1, 1), dtype=bool)
+    series = {}
+    for label, estimates, given in (
+        ("leading", theirs, Given(leads=True)),
+        ("other", ours, Given(paired=True)),
+    ):
+        tally = Tally(names, steps, ("all",), sheet, 5, given)
+        tally.add(0, scans, held, estimates)
+        series[label] = dict(tally.steps())
+    assert not any(DIFFERENCE in name for name in series["leading"])
+    for quantity in (POSITION, "velocity_squared_error_m2_s2"):
+        errors = [slow_scores(scans, e, names)[quantity] for e in (ours, theirs)]
+        difference = errors[0] - errors[1]
+        found = series["other"][quantity + DIFFERENCE]
+        present = (~np.isnan(difference)).sum(axis=1)
+        assert found.n.tolist() == present.tolist()
+        np.testing.assert_allclose(found.mean, np.nanmean(difference, axis=1), ROUNDING)
+        spread = np.nanvar(difference, axis=1) * present
+        np.testing.assert_allclose(found.squares, spread, 1e-10)
 
 
 # ---- tallies ---------------------------------------------------------------------------------
@@ -299,7 +388,7 @@ def test_moments_of_a_step_are_those_of_the_runs_that_are_wanted(runs, gaps):
     rng = np.random.default_rng(10)
     row = 1e3 + rng.normal(size=32)
     row[rng.random(32) < gaps] = np.nan
-    totals = Totals(*np.full((3, 2, 4), -7.0), *(np.empty(0),) * 3)
+    totals = Totals(*np.full((3, 2, 4), -7.0), *(np.empty(0),) * 4)
     finite = add_to_step(row, runs, totals, 1, 2)
     present = row[:runs][~np.isnan(row[:runs])]
     assert finite == (present.size == runs)
@@ -314,12 +403,13 @@ def test_moments_of_a_step_are_those_of_the_runs_that_are_wanted(runs, gaps):
 def test_window_sums_and_step_moments_of_spans_are_those_of_the_whole(wide):
     rng = np.random.default_rng(11)
     steps, lanes, runs = 10, 8, 5
-    scans, estimates = span(rng, steps=steps, lanes=lanes)
+    scans, estimates = foreseen(*span(rng, steps=steps, lanes=lanes), rng)
     scans.measurements[rng.random(scans.measurements.shape) < 0.1] = np.nan
     estimates.mean[6:, 0, 3] = np.nan
     names = Names(TRUTH_STATES, ("a", "b"), SIX_STATES, ("a", "b"))
     held = rng.random((steps, 3, lanes if wide else 1)) < 0.5
-    tally = Tally(names, steps, ("a", "b", "c"), blank_sheet(steps, lanes), runs, likelihoods=True)
+    given = Given(likelihoods=True, final=True)
+    tally = Tally(names, steps, ("a", "b", "c"), blank_sheet(steps, lanes), runs, given)
     for begin, end in ((0, 4), (4, 10)):
         part = Estimates(*(array[begin:end] for array in estimates))
         tally.add(begin, scans.cut(slice(begin, end)), held[begin:end], part)
@@ -330,9 +420,12 @@ def test_window_sums_and_step_moments_of_spans_are_those_of_the_whole(wide):
         missed = np.isnan(scans.measurements).any(axis=1)
         likelihoods = np.where(missed, np.nan, estimates.mode_likelihoods[:, j])
         expected[f"mode_likelihood:{mode}"] = likelihoods
+    expected["final_mode_probability"] = estimates.final_mode_probability
+    expected["final_mode_prior"] = np.repeat(estimates.final_mode_prior, lanes, axis=1)
     moments, sums = dict(tally.steps()), dict(tally.sums())
     assert set(moments) == set(expected) - {POSITION_AT_SCANS}
-    assert {quantity for _, quantity in sums} == {q for q in expected if ":" not in q}
+    series = {"final_mode_probability", "final_mode_prior"}
+    assert {quantity for _, quantity in sums} == {q for q in expected if ":" not in q} - series
     for quantity, values in moments.items():
         wanted = expected[quantity][:, :runs]
         present = ~np.isnan(wanted)

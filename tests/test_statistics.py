@@ -22,7 +22,9 @@ from hybridtrack.statistics import (
     merge_vectors,
     pair_moments,
     ratio_of_sums,
+    reliability,
     sum_moments,
+    vector_moments,
 )
 
 ROUNDING = 1e-12  # relative: some 1e2 operations of 1e-16, a margin of 100
@@ -398,3 +400,87 @@ def test_pairs_merge_along_all_their_axes():
     assert merged.n.tolist() == whole.n.tolist() == [90, 90, 0]
     for ours, expected in zip(merged, whole, strict=True):
         np.testing.assert_allclose(ours, expected, rtol=1e-9)  # differences of like numbers
+
+
+# ---- reliability -----------------------------------------------------------------------------
+
+
+def foretold(rng, runs, bins=4, steps=30, slope=0.6):
+    """Sums by bins of each run (3 bins, runs), and the flat probabilities, events and run numbers.
+
+    Events come with probability .2 + slope p, so forecasts p are off; runs differ in their level.
+    """
+    p = np.clip(rng.beta(0.6, 0.6, size=(runs, 1)) + rng.normal(0, 0.1, (runs, steps)), 0, 0.999)
+    came = (rng.random(p.shape) < 0.2 + slope * p).astype(float)
+    place = (p * bins).astype(int)
+    sums = np.zeros((3, bins, runs))
+    for i in range(bins):
+        here = place == i
+        sums[:, i] = here.sum(axis=1), (p * here).sum(axis=1), (came * here).sum(axis=1)
+    return sums.reshape(3 * bins, runs), p, came
+
+
+def slow_reliability(p, came, bins):
+    """Share, mean probability, frequency by bin and the calibration error, value by value."""
+    place = np.minimum((p * bins).astype(int), bins - 1)
+    rows, gap = [], 0.0
+    for i in range(bins):
+        here = place == i
+        rows.append((here.mean(), p[here].mean(), came[here].mean()))
+        gap += abs(p[here].mean() - came[here].mean()) * here.mean()
+    return np.array(rows).T, gap
+
+
+def test_reliability_is_what_it_is_value_by_value():
+    rng = np.random.default_rng(31)
+    sums, p, came = foretold(rng, 300)
+    parts = (slice(0, 100), slice(100, 250), slice(250, 300))
+    merged = functools.reduce(
+        merge_vectors, [vector_moments(sums[:, s], np.ones(s.stop - s.start, bool)) for s in parts]
+    )
+    found = reliability([merged])
+    expected, gap = slow_reliability(p, came, 4)
+    np.testing.assert_allclose(found[:3], expected, rtol=1e-10)
+    assert found.calibration_error.value == pytest.approx(gap, rel=1e-10)
+    assert found.calibration_error.n_runs == 300
+
+
+def test_reliability_has_the_bootstraps_errors():
+    """Over runs, which differ. 400 resamples tell a standard error to 3.5 %: three of these."""
+    rng = np.random.default_rng(32)
+    sums, _, _ = foretold(rng, 400)
+    everyone = np.ones(400, dtype=bool)
+    found = reliability([vector_moments(sums, everyone)])
+    resampled = []
+    for _ in range(400):
+        again = reliability([vector_moments(sums[:, rng.integers(0, 400, 400)], everyone)])
+        resampled.append([*again.frequency, again.calibration_error.value])
+    errors = np.std(resampled, axis=0, ddof=1)
+    np.testing.assert_allclose(found.standard_error, errors[:-1], rtol=0.12)
+    assert found.calibration_error.standard_error == pytest.approx(errors[-1], rel=0.12)
+
+
+def test_reliability_of_several_cases_and_of_nothing():
+    rng = np.random.default_rng(33)
+    halves = [foretold(rng, 100, slope=s)[0] for s in (0.2, 0.7)]
+    everyone = np.ones(100, dtype=bool)
+    strata = reliability([vector_moments(half, everyone) for half in halves])
+    together = reliability([vector_moments(np.hstack(halves), np.ones(200, dtype=bool))])
+    np.testing.assert_allclose(strata[:3], together[:3], rtol=1e-10)
+    assert (strata.standard_error <= together.standard_error * 1.01).all()  # 1/(n - 1) twice
+    empty = np.zeros((12, 100))
+    none = reliability([vector_moments(empty, everyone)])
+    assert math.isnan(none.calibration_error.value)
+    assert np.isnan(none.frequency).all()
+    one = reliability([vector_moments(halves[0][:, :1], everyone[:1])])
+    assert math.isnan(one.calibration_error.standard_error)
+
+
+def test_diverged_runs_leave_the_reliability():
+    rng = np.random.default_rng(34)
+    sums, p, came = foretold(rng, 50)
+    sound = rng.random(50) < 0.7
+    sums[:, ~sound] = np.nan
+    found = reliability([vector_moments(sums, sound)])
+    expected, _ = slow_reliability(p[sound], came[sound], 4)
+    np.testing.assert_allclose(found[:3], expected, rtol=1e-10)

@@ -28,6 +28,7 @@ def folder(tmp_path):
         "modes": ["CV"],
         "windows": ["all", "turn", "nowhere"],
         "compare_with": None,
+        "error": "rmse",
     }
     (tmp_path / results.MANIFEST).write_text(json.dumps(manifest))
     rows = [
@@ -41,7 +42,7 @@ def folder(tmp_path):
         )
     ]
     published = [
-        ("long " + "Y" * 90, LONG, "m", "all", 1.0, None, 2.0, 0.1, "[x]", "x", False, "[/z]")
+        ("long " + "Y" * 90, LONG, "m", "all", 1.0, 0.5, None, 2.0, 0.1, "[x]", "x", False, "[/z]")
     ]
     for name, filled in (("summary", rows), ("published", published), ("comparisons", [])):
         columns = results.SCHEMAS[name].names
@@ -133,3 +134,35 @@ def test_json_has_neither_nan_nor_infinity(folder):
     text = json.dumps(data, allow_nan=False)  # raises where there is one
     assert json.loads(text) == data
     assert {row["standard_error"] for row in data["summary"]} >= {None}
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ({"published": 18.0, "sign": None, "estimator": "IMM"}, "18"),
+        ({"published": 18.0, "sign": "less", "estimator": "IMM"}, "< 18"),
+        ({"published": 18.0, "sign": "greater", "estimator": "IMM"}, "> 18"),
+        ({"published": 0.8, "sign": "less", "estimator": "A / B"}, "0.8"),
+        ({"published": None, "sign": "less", "estimator": "A / B"}, "Δ < 0"),
+        ({"published": None, "sign": "greater", "estimator": "A / B"}, "Δ > 0"),
+        ({"published": 1.0, "sign": "equal", "estimator": "A / B"}, "ratio 1±0.05"),
+        ({"published": 50.0, "sign": None, "estimator": None}, "50"),
+    ],
+)
+def test_what_was_claimed_in_few_words(row, said):
+    assert tables.claimed({"tolerance": 0.05, **row}) == said
+
+
+def test_squared_errors_are_shown_where_the_scenario_asks(folder):
+    manifest = json.loads((folder / results.MANIFEST).read_text())
+    (folder / results.MANIFEST).write_text(json.dumps(manifest | {"error": "mse"}))
+    rows = results.read_rows(folder, "summary")
+    names = {"position_rmse_m": "position_mse_m2", "velocity_rmse_m_s": "velocity_mse_m2_s2"}
+    for row in rows:
+        row["metric"] = names.get(row["metric"], row["metric"])
+    squared = results.pa.Table.from_pylist(rows, schema=results.SCHEMAS["summary"])
+    results.pq.write_table(squared, folder / "summary.parquet")
+    text = shown(folder, 200)
+    assert "MSE, m²/s²" in text
+    assert "RMS" not in text
+    assert "123456.789±0.001" in text

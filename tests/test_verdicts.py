@@ -19,6 +19,7 @@ from hybridtrack.verdicts import (
     Claim,
     _student,
     judge_comparison,
+    judge_exact,
     judge_figure,
     printed_tolerance,
 )
@@ -41,6 +42,60 @@ def figure(value, error, *, n_runs=MANY, assumptions=False, published=18.0, tole
 def comparison(difference, error, *, sign="less", value=None, tolerance=0.0, ratio=NOTHING, n=MANY):
     ours = Paired(1.0 + difference, 1.0, Estimate(difference, error, n), ratio)
     return judge_comparison(claim(value, tolerance, sign=sign), ours, assumptions=False).verdict
+
+
+def equal(ratio, error, *, tolerance=0.05, value=1.0, assumptions=False):
+    given = claim(value, tolerance, sign="equal")
+    ours = Paired(ratio, 1.0, Estimate(ratio - 1.0, 0.0, MANY), Estimate(ratio, error, MANY))
+    outcome = judge_comparison(given, ours, assumptions)
+    assert outcome.ours == ours.ratio
+    return outcome.verdict
+
+
+@pytest.mark.parametrize(
+    ("ratio", "error", "verdict"),
+    [
+        (1.02, 0.001, REPRODUCED),
+        (0.98, 0.001, REPRODUCED),
+        (1.05, 0.016, REPRODUCED),  # three errors are .048
+        (1.05, 0.017, UNDECIDED),  # three errors are .051, wider than what is called equal
+        (1.06, 0.001, NOT_REPRODUCED),
+        (0.94, 0.001, NOT_REPRODUCED),
+        (1.06, 0.02, UNDECIDED),
+    ],
+)
+def test_two_that_are_said_to_be_equal(ratio, error, verdict):
+    assert equal(ratio, error) == verdict
+    if verdict == REPRODUCED:
+        assert equal(ratio, error, assumptions=True) == ASSUMED
+
+
+@pytest.mark.parametrize(
+    ("sign", "value", "verdict"),
+    [
+        ("less", 16.9, REPRODUCED),
+        ("less", 17.5, UNDECIDED),
+        ("less", 18.5, UNDECIDED),
+        ("less", 19.1, NOT_REPRODUCED),
+        ("greater", 19.1, REPRODUCED),
+        ("greater", 16.9, NOT_REPRODUCED),
+    ],
+)
+def test_a_figure_on_one_side_of_a_bound(sign, value, verdict):
+    """A bound of 18, three standard errors of 1/3."""
+    given = claim(18.0, 0.5)._replace(sign=sign)
+    ours = Estimate(value, 1 / 3, MANY)
+    assert judge_figure(given, ours, assumptions=True).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("exact", "verdict"), [(0.2143, REPRODUCED), (0.25, REPRODUCED), (0.26, NOT_REPRODUCED)]
+)
+def test_a_figure_that_needs_no_run(exact, verdict):
+    outcome = judge_exact(claim(0.2, 0.05)._replace(exact=exact))
+    assert outcome.verdict == verdict
+    assert outcome.ours.value == exact
+    assert outcome.differs == (verdict != REPRODUCED)
 
 
 # ---- printed digits --------------------------------------------------------------------------
