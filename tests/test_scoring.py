@@ -83,12 +83,11 @@ def slow_scores(scans, estimates, names):
                 note("true_mode_probability", k, run, p[mode])
             if len(estimates.final_mode_probability) and len(scans.truth.final):
                 final = scans.truth.final[k, here]
-                p, prior = (
-                    estimates.final_mode_probability[k, run],
-                    estimates.final_mode_prior[k, 0],
-                )
-                note("final_mode_brier", k, run, (p - final) ** 2)
-                note("final_mode_prior_brier", k, run, (prior - final) ** 2)
+                for name, told in (
+                    ("final_mode_brier", estimates.final_mode_probability[k, run]),
+                    ("final_mode_prior_brier", estimates.final_mode_prior[k, 0]),
+                ):
+                    note(name, k, run, (told - final) ** 2)
             if (
                 len(estimates.mode_likelihoods)
                 and not np.isnan(scans.measurements[k, :, run]).any()
@@ -356,7 +355,7 @@ def test_errors_are_held_against_the_leading_ones_run_by_run():
     rng = np.random.default_rng(14)
     (scans, ours), (_, theirs) = span(rng, truth_lanes=1), span(rng)
     ours.mean[2, 0, 1] = np.nan
-    names = Names(TRUTH_STATES, (), SIX_STATES, ("a",))
+    names = Names(TRUTH_STATES, ("a", "b"), SIX_STATES, ("a", "b"))
     sheet, steps = blank_sheet(*ours.mean.shape[::2]), len(ours.mean)
     held = np.ones((steps, 1, 1), dtype=bool)
     series = {}
