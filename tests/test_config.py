@@ -53,7 +53,7 @@ RUNS = "monte_carlo: {runs: 1000, seed: 5}"
 TYPES = "there are genie, hbf, imm, kalman, mmae, rmimm, sbf"
 MOTIONS = (
     "constant_velocity, constant_velocity_with_input, constant_velocity_zero_acceleration, "
-    "coordinated_turn, wiener_acceleration"
+    "coordinated_turn, wiener_acceleration, wiener_acceleration_as_printed"
 )
 LETTERS = "use letters, digits, _ and - only"
 LONG = "x" * 65
@@ -449,10 +449,10 @@ FIT: list[tuple[Edit, str]] = [
     ((COMPARE, f"»{COMPARE}".replace("RMIMM, IMM", "IMM, IMM")), "'compare' names IMM twice; name"),
     (
         (COMPARE, COMPARE.replace("greater", "bigger").replace("sign", "»sign")),
-        "must be less or gr",
+        "must be less, greater or eq",
     ),
     ((COMPARE, f"»window: turn_onst\n    {COMPARE}"), "is not defined; did you mean 'turn_onset'?"),
-    (("    value: 18\n", "    value: 18\n    »sign: less\n"), "belongs to a claim with 'compare'"),
+    (("    value: 18\n", "    value: 18\n    »sign: equal\n"), "'sign' equal has no place in this"),
     (
         ("expect: reproduced with stated assumptions", "»expect: yes"),
         "is yes; it must be reproduced, reproduced with stated assumptions, direction only or not",
@@ -486,19 +486,19 @@ ELSEWHERE: list[tuple[list[Edit], str]] = [
     ),
     (
         [ACCURACY, (COMPARE, "metric: mode_accuracy")],
-        "a claim needs 'estimator' or 'compare', and not both",
+        "a claim needs one of 'estimator', 'compare' and 'figure'",
     ),
     (
         [ACCURACY, (COMPARE, f"estimator: IMM\n    {COMPARE}")],
-        "a claim needs 'estimator' or 'compare', and not both",
+        "a claim needs one of 'estimator', 'compare' and 'figure'",
     ),
     (
         [ACCURACY, (COMPARE, "compare: [RMIMM, IMM]\n    metric: mode_accuracy")],
-        "'sign' is missing in this comparison; add less or greater",
+        "'sign' is missing in this comparison; add less, greater or equal",
     ),
     (
         [("- claim: IMM position", "- »claim: IMM position"), ("    value: 18\n", "")],
-        "'value' is missing in this claim on one estimator; add it",
+        "'value' is missing in this claim on one figure; add it",
     ),
     (
         [(FIGURE, "estimator: KF_CV\n    »metric: mode_brier")],

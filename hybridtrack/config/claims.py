@@ -56,8 +56,8 @@ def built_claim(
 
 
 def _check_exact(claim: ClaimForm, document: Document, path: Keys) -> None:
-    for key in ("metric", "window"):
-        if key in claim.model_fields_set:
+    for key, of_runs in (("metric", claim.metric is not None), ("window", claim.window != "all")):
+        if of_runs:
             raise document.error(
                 (*path, key), f"'{key}' is a run's, and 'figure' needs none; remove one of them"
             )
@@ -93,7 +93,7 @@ def _check_of_runs(
         raise document.error(
             path, "'sign' is missing in this comparison; add less, greater or equal"
         )
-    if claim.sign == "equal" and claim.tolerance is None:
+    if claim.compare is not None and claim.sign == "equal" and claim.tolerance is None:
         raise document.error(
             path, "'tolerance' is missing: how far from 1 may the ratio of two that are equal be?"
         )
