@@ -142,3 +142,45 @@ def enumerate_mode_sequences(model, z, initial_mean=None):
     weights = normalised(np.array(log_weights))
     mode_probabilities = np.bincount(last, weights=weights, minlength=n)
     return (*moments(weights, xs, Ps), mode_probabilities)
+
+
+def best_sequences(model, z, most):
+    """The tree of mode sequences, its best `most` kept after every scan; one run.
+
+    Modes of one name (supermodes) are one mode in several stages, with a weight each. Returns a
+    list per step of (mean, covariance, probabilities of the supermodes).
+    """
+    names = np.array(model.mode_names)
+    with np.errstate(divide="ignore"):
+        start = np.log(model.initial_mode_probabilities)
+    kept = [(start, model.initial_mean, model.initial_covariance)]
+    history = []
+    for k in range(len(z)):
+        with np.errstate(divide="ignore"):
+            log_matrix = np.log(at(model.transition_matrix, k))
+        grown = []
+        for log_weights, x0, P0 in kept:
+            moved = np.logaddexp.reduce(log_weights[:, np.newaxis] + log_matrix, axis=0)
+            for name in dict.fromkeys(names):
+                log_weight = np.where(names == name, moved, -np.inf)
+                if np.isneginf(log_weight).all():
+                    continue
+                j = np.argmax(names == name)
+                x, P = kalman_predict(
+                    x0,
+                    P0,
+                    at(model.state_transition, k)[j],
+                    at(model.input_effect, k)[j],
+                    at(model.process_noise_covariance, k)[j],
+                )
+                if not np.isnan(z[k]).any():
+                    H, R = model.measurement_matrix[j], model.measurement_noise_covariance[j]
+                    x, P, _, log_likelihood = kalman_update(x, P, H, R, z[k])
+                    log_weight = log_weight + log_likelihood
+                grown.append((log_weight, x, P))
+        grown.sort(key=lambda sequence: np.logaddexp.reduce(sequence[0]), reverse=True)
+        kept = grown[:most]
+        log_weights, xs, Ps = zip(*kept, strict=True)
+        weights = normalised(np.array(log_weights))
+        history.append((*moments(weights.sum(axis=1), xs, Ps), weights.sum(axis=0)))
+    return history

@@ -75,7 +75,7 @@ def test_a_cache_without_room(tmp_path):
 
 def test_small_cases_run_without_compilation():
     tests = Path(__file__).parent
-    chosen = ["-k", "vectors or reference or spans or hand or unreachable"]
+    chosen = ["-k", "vectors or reference or spans or hand or unreachable or exact"]
     done = subprocess.run(
         [
             sys.executable,
@@ -83,6 +83,7 @@ def test_small_cases_run_without_compilation():
             "pytest",
             tests / "test_vectors.py",
             tests / "test_bank.py",
+            tests / "test_best_sequences.py",
             *chosen,
         ],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"},

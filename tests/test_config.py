@@ -50,7 +50,8 @@ FLOOR = "RMIMM: {type: rmimm, residual_floor_m: 1.0}"
 WINDOW = "straight_settled: {mode: CV, after_switch_s: 10}"
 COMPARE = "compare: [RMIMM, IMM]\n    metric: mode_accuracy\n    sign: greater"
 RUNS = "monte_carlo: {runs: 1000, seed: 5}"
-TYPES = "there are genie, hbf, imm, kalman, mmae, rmimm, sbf"
+ESTIMATORS = "best_sequences, genie, hbf, imm, kalman, mmae, rmimm, sbf"
+TYPES = f"there are {ESTIMATORS}"
 MOTIONS = (
     "constant_velocity, constant_velocity_with_input, constant_velocity_zero_acceleration, "
     "coordinated_turn, wiener_acceleration, wiener_acceleration_as_printed"
@@ -226,18 +227,21 @@ KINDS: list[tuple[Edit, str]] = [
     ((MMAE, "MMAE: {»type: [mmae]}"), f"'type' is a list, which is not known; {TYPES}"),
     (
         (MMAE, "MMAE: {»type: }"),
-        "'type' is missing in 'MMAE'; add one of genie, hbf, imm, kalman, mmae, rmimm, sbf",
+        f"'type' is missing in 'MMAE'; add one of {ESTIMATORS}",
     ),
     (
         (MMAE, "»MMAE: {}"),
-        "'type' is missing in 'MMAE'; add one of genie, hbf, imm, kalman, mmae, rmimm, sbf",
+        f"'type' is missing in 'MMAE'; add one of {ESTIMATORS}",
     ),
     (
         (MMAE, "»MMAE:"),
-        "'type' is missing in 'MMAE'; add one of genie, hbf, imm, kalman, mmae, rmimm, sbf",
+        f"'type' is missing in 'MMAE'; add one of {ESTIMATORS}",
     ),
-    ((MMAE, "»MMAE: mmae"), "'MMAE' is mmae; it must be a mapping, such as {type: genie}"),
-    ((MMAE, "»MMAE: [mmae]"), "'MMAE' is a list; it must be a mapping, such as {type: genie}"),
+    ((MMAE, "»MMAE: mmae"), "'MMAE' is mmae; it must be a mapping, such as {type: best_sequences}"),
+    (
+        (MMAE, "»MMAE: [mmae]"),
+        "'MMAE' is a list; it must be a mapping, such as {type: best_sequences}",
+    ),
     ((CT, "CT: {»motion: weiner_acceleration}"), "is weiner_acceleration, which is not known; did"),
     ((CT, "CT: {»motion: banana}"), f"'motion' is banana, which is not known; there are {MOTIONS}"),
     ((CT, "CT: {»motion: matrices}"), f"is matrices, which is not known; there are {MOTIONS}"),
@@ -618,6 +622,24 @@ MATRICES: list[tuple[list[Edit], str]] = [
     (
         [("IMM: {type: imm}", "»IMM: {type: sbf}")],
         "'continuation_probability' is missing in 'IMM'; add it",
+    ),
+    (
+        [
+            (
+                "IMM: {type: imm}",
+                "»IMM: {type: best_sequences, continuation_probability: 0.9, most_transitions: 2}",
+            )
+        ],
+        "'IMM': 'most_transitions' bounds the chain hard and 'continuation_probability' softly; "
+        "remove one",
+    ),
+    (
+        [("{type: imm}", "{type: best_sequences, »continuation_probability: -0.5}")],
+        "'continuation_probability' is -0.5; it must be at least 0",
+    ),
+    (
+        [("{type: imm}", "{type: best_sequences, »sequences: 1001}")],
+        "'sequences' is 1001; it must be at most 1000",
     ),
 ]
 

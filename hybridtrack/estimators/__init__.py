@@ -165,10 +165,10 @@ class Running:
         known_modes: Array = NO_KNOWN_MODES,
     ) -> Estimates:
         """See AtWork."""
-        room = _memory.room(
+        room = memory.room(
             self._model, len(measurements), self._lanes, len(self.mode_names) > 1, covariance
         )
-        work = _memory.workspace(self._model)
+        work = memory.workspace(self._model)
         _bank.run_span(
             self._state, work, prepared.kernel, self._recursion, measurements, room, known_modes
         )
@@ -205,4 +205,4 @@ class _Memory(threading.local):
         return Estimates(*(array[:steps] for array in kept))
 
 
-_memory = _Memory()
+memory = _Memory()

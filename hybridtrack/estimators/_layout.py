@@ -225,8 +225,8 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
     names = output_modes(model)
     only_origin = _only_nonzero(np.swapaxes(model.transition_matrix, 1, 2))
     return KernelModel(
-        state_map=_sparse(model.state_transition),
-        covariance_map=_sparse(_covariance_map(model.state_transition)),
+        state_map=sparse(model.state_transition),
+        covariance_map=sparse(_covariance_map(model.state_transition)),
         input_effect=np.ascontiguousarray(model.input_effect),
         process_noise_covariance=np.ascontiguousarray(
             model.process_noise_covariance[..., lower[0], lower[1]]
@@ -257,7 +257,7 @@ def _covariance_map(F: Array) -> Array:
     return matrix
 
 
-def _sparse(matrices: Array) -> SparseMaps:
+def sparse(matrices: Array) -> SparseMaps:
     """matrices (n_times, n_modes, n_rows, n_columns), the same zeros at all times."""
     n_times, n_modes, n_rows, _ = matrices.shape
     kept = (matrices != 0).any(axis=0)
