@@ -124,9 +124,13 @@ class BestSequences:
         """Never."""
         return False
 
+    def bound(self, settings: Settings) -> Bound:
+        """The soft one's, the hard one's or none."""
+        return Bound(settings.continuation_probability, settings.leak, settings.most_transitions)
+
     def prepare(self, settings: Settings, model: JumpMarkovModel) -> Prepared:
         """The bank's modes, and the chain of supermodes beside them."""
-        bound = Bound(settings.continuation_probability, settings.leak, settings.most_transitions)
+        bound = self.bound(settings)
         if bound.continuation_probability is None and bound.leak:
             raise UserError(
                 "'leak' brings back a mode that has ended, and without 'continuation_probability' "
@@ -137,7 +141,6 @@ class BestSequences:
                 "'most_transitions' bounds the chain hard and 'continuation_probability' softly; "
                 "remove one"
             )
-        bounded = bound != Bound()
         found = bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
         members = found.mode == np.arange(len(model.mode_names))[:, np.newaxis]
         chain = Chain(
@@ -147,11 +150,11 @@ class BestSequences:
             log_origins=_in_logarithms(np.swapaxes(found.transition_matrix, 1, 2)),
             log_members=_in_logarithms(members[np.newaxis].astype(np.float64)),
             final_probability=np.ascontiguousarray(
-                found.final_probability[: None if bounded else 0]
+                found.final_probability[: None if bound.is_set else 0]
             ),
         )
         kernel = kernel_model(model)
-        if bounded:  # for the room of the estimates
+        if bound.is_set:  # for the room of the estimates
             model = model._replace(final_probability=found.final_probability)
         return Prepared(kernel, chain, model)
 
