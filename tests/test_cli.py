@@ -92,7 +92,7 @@ def test_run_prints_table_verdicts_and_folder_last(finished):
     folder = cwd / lines[-1]
     assert folder.parent.name == "runs"
     names = {path.name for path in folder.iterdir()}
-    tables = ("summary", "steps", "runs", "tracks", "published", "comparisons")
+    tables = ("summary", "steps", "runs", "tracks", "published", "comparisons", "reliability")
     assert names >= {f"{t}.parquet" for t in tables}
     assert names >= {"config.yaml", "manifest.json", "summary.csv", "figures"}
     assert not [name for name in names if name.endswith(".part")]
@@ -100,6 +100,7 @@ def test_run_prints_table_verdicts_and_folder_last(finished):
         "trajectory",
         "position_error",
         "velocity_error",
+        "error_ratio",
         "mode_probability",
         "mode_likelihood",
     }

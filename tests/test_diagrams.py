@@ -308,10 +308,13 @@ def test_an_estimators_bound_is_its_models():
     for name, estimator in estimators().items():
         if name != "kalman":  # which has one mode of a bank's
             settings = estimator.settings(*given.get(name, ()))
-            own = estimator.model(model, settings)
             chain = estimator.bound(settings).supermodes(
                 model.transition_matrix, model.initial_mode_probabilities
             )
+            if not hasattr(estimator, "model"):  # it has no other chain than this
+                assert name == "best_sequences"
+                continue
+            own = estimator.model(model, settings)
             np.testing.assert_array_equal(chain.transition_matrix, own.transition_matrix)
             np.testing.assert_array_equal(
                 chain.initial_probabilities, own.initial_mode_probabilities

@@ -26,7 +26,7 @@ from hybridtrack.results import (
 from hybridtrack.statistics import METRICS, RunSums, compare, pair_moments, ratio_of_sums
 from models import RANDOM, SMALL, read_table, scenario
 
-TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published")
+TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published", "reliability")
 
 TINY = """
 name: tiny

@@ -5,7 +5,13 @@ import pytest
 
 from hybridtrack import config, experiment, outcomes, results
 from hybridtrack.models import Mode
+from hybridtrack.verdicts import UNDECIDED
 from models import read_table
+
+# True by some four standard errors of as many runs as are shipped: one seed in six misses three.
+NARROW = {
+    ("softbound_ex1", "HBF is slightly better than IMM in the second half (velocity)"),
+}
 
 
 def quiet(done, total):
@@ -27,7 +33,10 @@ def test_every_scenario_runs_and_every_verdict_is_the_expected_one(name, tmp_pat
     experiment.run(shipped, tmp_path / name, 2, quiet)
     assert results.require_complete(tmp_path / name)["diverged"] == {}
     for row in results.read_rows(tmp_path / name, "published"):
-        assert row["verdict"] == row["expected_verdict"], row
+        expected = {row["expected_verdict"]}
+        if (name, row["claim"]) in NARROW:
+            expected.add(UNDECIDED)
+        assert row["verdict"] in expected, row
 
 
 def test_the_recorded_flight_is_what_it_was(flight):
