@@ -9,33 +9,73 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hybridtrack import config, experiment, tables
+from hybridtrack import config, experiment, results, tables
 from hybridtrack.studies.ledger import markdown
 
 README = Path(__file__).parent.parent / "README.md"
 PART = re.compile(r"(<!-- generated: (?P<what>[^>]+) -->\n)(?P<text>.*?)(<!-- end -->)", re.DOTALL)
-RECORDED, FIGURE_5 = "recorded_flight", "rmimm_fig5"
+SHOWN = ("rmimm_fig5", "recorded_flight")
+EXAMPLES = {  # of Sigalov 2011, and what the truth is in each
+    "softbound_ex1": "a soft bound",
+    "softbound_ex2": "at most 4 transitions",
+    "softbound_ex3": "no bound",
+}
+YARDSTICKS = {  # the same, with the most probable sequences on the truth's own chain besides
+    "softbound_ex1+BEST": "a soft bound",
+    "softbound_ex3+BEST": "no bound",
+}
 
 
 def finished_runs(root: Path) -> dict[str, Path]:
-    """Every scenario that the README shows, run at its full size."""
+    """Every scenario that the README shows or that has published claims, at its full size."""
     folders = {}
-    for name in (FIGURE_5, RECORDED):
-        folders[name] = root / name
-        experiment.run(config.load(name), folders[name], 2, lambda done, total: None)
+    for name in config.shipped():
+        shipped = config.load(name)
+        if name in SHOWN or shipped.claims:
+            folders[name] = root / name
+            experiment.run(shipped, folders[name], 2, lambda done, total: None)
+    for name, bound in (
+        ("softbound_ex1", ", continuation_probability: 0.98"),
+        ("softbound_ex3", ""),
+    ):
+        best = f"estimators.BEST={{type: best_sequences{bound}}}"
+        shipped = config.load(name, ["monte_carlo.runs=2400", best, "compare_with=BEST"])
+        folders[f"{name}+BEST"] = root / f"{name}+BEST"
+        experiment.run(shipped, folders[f"{name}+BEST"], 2, lambda done, total: None)
     return folders
 
 
 def generated(what: str, folders: dict[str, Path]) -> str:
     """The text of one part."""
     if what == "ledger":
-        return "\n" + markdown([folders[FIGURE_5]]) + "\n"
+        return (
+            "\n" + markdown([folders[n] for n in config.shipped() if config.load(n).claims]) + "\n"
+        )
+    if what == "ratios to the genie":
+        return "\n" + ratios(folders, EXAMPLES, ("SBF", "HBF", "IMM", "KF_m2")) + "\n"
+    if what == "ratios to the best sequences":
+        return "\n" + ratios(folders, YARDSTICKS, ("genie", "SBF", "HBF", "IMM")) + "\n"
     name = what.removeprefix("hybridtrack run ")
     out = io.StringIO()
     tables.show(folders[name], Console(file=out, width=80, highlight=False, no_color=True))
     lines = [line.rstrip() for line in out.getvalue().splitlines()]
     lines += [f"figures: runs/{name}-DIGEST/figures", f"runs/{name}-DIGEST"]
     return "\n".join(["```text", f"$ {what}", *lines, "```", ""])
+
+
+def ratios(folders: dict[str, Path], scenarios: dict[str, str], labels: tuple[str, ...]) -> str:
+    """Mean square errors over those of the estimator compared with, position and velocity."""
+    lines = [f"| scenario | | {' | '.join(labels)} |", "| --- " * (len(labels) + 2) + "|"]
+    for name, said in scenarios.items():
+        found = {
+            (row["first"], row["metric"]): tables.figure(row["ratio"], row["ratio_standard_error"])
+            for row in results.read_rows(folders[name], "comparisons")
+            if row["window"] == "all"
+        }
+        metrics = ("position_mse_m2", "velocity_mse_m2_s2")
+        cells = [" / ".join(found[label, metric] for metric in metrics) for label in labels]
+        lines.append(f"| `{name.removesuffix('+BEST')}` | {said} | {' | '.join(cells)} |")
+    return "\n".join([*lines, ""])
 
 
 def renewed(text: str, folders: dict[str, Path]) -> str:
