@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hybridtrack import config
 from hybridtrack.blocks import run_block
@@ -23,42 +23,69 @@ from hybridtrack.executors import available_cores, in_order
 from hybridtrack.experiment import plan
 from hybridtrack.simulation import BLOCK_RUNS
 
-SCENARIO = "rmimm_fig5"
 RUNS = 20_000
 SAMPLE_S = 0.05
 LARGEST_MB = 600
 CORES_GAIN = 1.7
-END_TO_END = 2.0
 GAIN_ROUNDS = 20  # half a second each: many, since others use the machine too
 
 
+class Study(NamedTuple):
+    """A scenario as the figures of a whole run are asked of it."""
+
+    scenario: str
+    settings: tuple[str, ...]
+    end_to_end: float  # CPU time of the command over its filters', at most
+
+
+FIGURE_5 = Study("rmimm_fig5", (), 2.0)
+EXAMPLE_1 = Study(  # of Sigalov 2011, with its four filters
+    "softbound_ex1",
+    (
+        "estimators={genie: {type: genie}, SBF: {type: sbf, continuation_probability: 0.98}, "
+        "HBF: {type: hbf, most_transitions: 4}, IMM: {type: imm}}",
+        "published=[]",
+    ),
+    2.5,
+)
+
+
 def measure(rounds: int) -> list[str]:
-    """Every figure of a whole run, as a Markdown table."""
-    everything = config.load(SCENARIO, [f"monte_carlo.runs={RUNS}"])
-    lines = [f"| {SCENARIO}, {RUNS:,} runs | measured | aim |", "| --- | --: | --: |"]
-    if available_cores() >= 2:
-        for name, labels in (("IMM only", ("IMM",)), ("all estimators", None)):
-            number = max(rounds, GAIN_ROUNDS)
-            threads = _spread(_gain_by_threads(labels, number))
-            processes = _spread(_gain_by_processes(labels, number))
-            lines += [
-                f"| throughput, 2 threads over 1, {name} | {threads} | {CORES_GAIN} |",
-                f"| 2 processes that share nothing, {name} | {processes} | |",
-            ]
-    filters_s, blocks_s = _blocks_cpu_s(everything)
-    _command(BLOCK_RUNS)  # compiles what no block needs, and warms the files
-    for runs in (RUNS, 10 * RUNS):
-        cpu_s, megabytes = _command(runs)
-        if runs == RUNS:
-            lines += [
-                f"| CPU time of the command | {cpu_s:.1f} s | |",
-                f"| CPU time of its blocks: drawn, filtered, scored | {blocks_s:.2f} s | |",
-                f"| CPU time of its filters | {filters_s:.2f} s | |",
-                f"| the command over its filters | {cpu_s / filters_s:.1f} | {END_TO_END} |",
-                f"| its blocks over its filters | {blocks_s / filters_s:.2f} | |",
-            ]
-        lines.append(f"| peak memory, {runs:,} runs | {megabytes:.0f} MB | {LARGEST_MB} MB |")
+    """Every figure of whole runs, as Markdown tables."""
+    lines = _gains(rounds) if available_cores() >= 2 else []
+    for study in (FIGURE_5, EXAMPLE_1):
+        lines += ["", *_costs(study)]
     return lines
+
+
+def _gains(rounds: int) -> list[str]:
+    lines = [f"| {FIGURE_5.scenario}, {RUNS:,} runs | measured | aim |", "| --- | --: | --: |"]
+    for name, labels in (("IMM only", ("IMM",)), ("all estimators", None)):
+        number = max(rounds, GAIN_ROUNDS)
+        threads = _spread(_gain_by_threads(labels, number))
+        processes = _spread(_gain_by_processes(labels, number))
+        lines += [
+            f"| throughput, 2 threads over 1, {name} | {threads} | {CORES_GAIN} |",
+            f"| 2 processes that share nothing, {name} | {processes} | |",
+        ]
+    return lines
+
+
+def _costs(study: Study) -> list[str]:
+    """CPU time and memory of the command at two sizes, its filters measured in the same run."""
+    _command(study, BLOCK_RUNS)  # compiles, and warms the files
+    filters_s, blocks_s = _blocks_cpu_s(study)
+    few, many = (_command(study, runs) for runs in (RUNS, 10 * RUNS))
+    return [
+        f"| {study.scenario} | {RUNS:,} runs | {10 * RUNS:,} runs | aim |",
+        "| --- | --: | --: | --: |",
+        f"| CPU time of the command | {few.cpu_s:.2f} s | {many.cpu_s:.1f} s | |",
+        f"| CPU time of its filters | {few.filters_s:.2f} s | {many.filters_s:.2f} s | |",
+        f"| the command over its filters | {few.ratio:.1f} | {many.ratio:.1f} "
+        f"| {study.end_to_end} |",
+        f"| blocks alone (drawn, filtered, scored) over filters | {blocks_s / filters_s:.2f} | | |",
+        f"| peak memory | {few.megabytes:.0f} MB | {many.megabytes:.0f} MB | {LARGEST_MB} MB |",
+    ]
 
 
 def _spread(values: list[float]) -> str:
@@ -77,15 +104,15 @@ def _wall_s(experiment: config.Experiment, workers: int) -> float:
 Labels = tuple[str, ...] | None  # estimators, None for all
 
 
-def _experiment(labels: Labels) -> config.Experiment:
-    experiment = config.load(SCENARIO, [f"monte_carlo.runs={RUNS}"])
+def _experiment(study: Study, labels: Labels = None) -> config.Experiment:
+    experiment = config.load(study.scenario, [*study.settings, f"monte_carlo.runs={RUNS}"])
     chosen = tuple(c for c in experiment.estimators if labels is None or c.label in labels)
     return experiment._replace(estimators=chosen)
 
 
 def _gain_by_threads(labels: Labels, rounds: int) -> list[float]:
     """Throughput of two threads over that of one, round by round."""
-    experiment = _experiment(labels)
+    experiment = _experiment(FIGURE_5, labels)
     _wall_s(experiment._replace(runs=BLOCK_RUNS), 1)  # compiles
     return [_wall_s(experiment, 1) / _wall_s(experiment, 2) for _ in range(rounds)]
 
@@ -95,7 +122,7 @@ def _gain_by_processes(labels: Labels, rounds: int) -> list[float]:
 
     Less than 2 where others use its cores too.
     """
-    experiment = _experiment(labels)
+    experiment = _experiment(FIGURE_5, labels)
     context = multiprocessing.get_context("spawn")
     barrier, times = context.Barrier(3), context.Queue()
     alone = [
@@ -116,7 +143,7 @@ def _gain_by_processes(labels: Labels, rounds: int) -> list[float]:
 
 def _alone(labels: Labels, rounds: int, barrier: Any, times: Any) -> None:
     """One of two processes that each do all blocks in one thread, at the same time."""
-    experiment = _experiment(labels)
+    experiment = _experiment(FIGURE_5, labels)
     _wall_s(experiment._replace(runs=BLOCK_RUNS), 1)
     for _ in range(rounds):
         barrier.wait()
@@ -125,15 +152,16 @@ def _alone(labels: Labels, rounds: int, barrier: Any, times: Any) -> None:
 
 
 @contextmanager
-def _timed_filters() -> Iterator[list[float]]:
-    """CPU time of this thread within Running.advance, summed in the list's one element."""
-    spent = [0.0]
+def timed_filters() -> Iterator[list[float]]:
+    """CPU time of all threads within Running.advance, summed in the list's one element."""
+    spent, lock = [0.0], threading.Lock()
     advance = Running.advance
 
     def timed(self: Running, *arguments: Any, **keywords: Any) -> Any:
         begin = time.thread_time()
         estimates = advance(self, *arguments, **keywords)
-        spent[0] += time.thread_time() - begin
+        with lock:
+            spent[0] += time.thread_time() - begin
         return estimates
 
     Running.advance = timed  # type: ignore[method-assign]
@@ -143,23 +171,57 @@ def _timed_filters() -> Iterator[list[float]]:
         Running.advance = advance  # type: ignore[method-assign]
 
 
-def _blocks_cpu_s(experiment: config.Experiment) -> tuple[float, float]:
-    """CPU time of the filters alone within a run of all blocks, and of all of it."""
-    with _timed_filters() as spent:
+def _blocks_cpu_s(study: Study) -> tuple[float, float]:
+    """CPU time of the filters alone within a run of all blocks, and of all of it, in one thread."""
+    experiment = _experiment(study)
+    _wall_s(experiment._replace(runs=BLOCK_RUNS), 1)  # loads what is compiled
+    with timed_filters() as spent:
         begin = time.process_time()
         _wall_s(experiment, 1)
         return spent[0], time.process_time() - begin
 
 
-def _command(runs: int) -> tuple[float, float]:
-    """CPU time (s) and peak memory (MB) of `hybridtrack run`, kernels compiled beforehand."""
+class Cost(NamedTuple):
+    """What one command took."""
+
+    cpu_s: float
+    filters_s: float
+    megabytes: float
+
+    @property
+    def ratio(self) -> float:
+        """The whole over its filters."""
+        return self.cpu_s / self.filters_s
+
+
+# The command itself, which leaves the CPU time of its filters in a file.
+INSIDE = """
+import sys
+from pathlib import Path
+from hybridtrack.cli import _spare_time, main
+_spare_time()
+sys.path.append(sys.argv.pop(1))
+import whole
+noted = Path(sys.argv.pop(1))
+with whole.timed_filters() as spent:
+    try:
+        main()
+    finally:
+        noted.write_text(repr(spent[0]))
+"""
+
+
+def _command(study: Study, runs: int) -> Cost:
+    """CPU time and peak memory of `hybridtrack run`."""
     with tempfile.TemporaryDirectory() as folder:
-        out = str(Path(folder) / "run")
-        options = ["--runs", str(runs), "--out", out, "--quiet", "--json"]
+        out, noted = Path(folder) / "run", Path(folder) / "filters"
+        options = ["--runs", str(runs), "--out", str(out), "--quiet", "--json"]
+        for setting in study.settings:
+            options += ["--set", setting]
+        inside = [sys.executable, "-c", INSIDE, str(Path(__file__).parent), str(noted)]
         before = os.times()
         process = subprocess.Popen(
-            [sys.executable, "-m", "hybridtrack", "run", SCENARIO, *options],
-            stdout=subprocess.DEVNULL,
+            [*inside, "run", study.scenario, *options], stdout=subprocess.DEVNULL
         )
         peak = [0.0]
         sampler = threading.Thread(target=_sample, args=(process, peak))
@@ -167,10 +229,11 @@ def _command(runs: int) -> tuple[float, float]:
         code = process.wait()
         sampler.join()
         if code != 0:
-            raise SystemExit(f"hybridtrack run {SCENARIO} ended with exit code {code}")
+            raise SystemExit(f"hybridtrack run {study.scenario} ended with exit code {code}")
         after = os.times()
-    spent = after.children_user + after.children_system
-    return spent - before.children_user - before.children_system, peak[0]
+        spent = after.children_user + after.children_system
+        spent -= before.children_user + before.children_system
+        return Cost(spent, float(noted.read_text()), peak[0])
 
 
 def _sample(process: "subprocess.Popen[bytes]", peak: list[float]) -> None:
