@@ -168,11 +168,7 @@ def _scale_error(ax: Axes, values: Mapping[str, Array]) -> list[str]:
         return []
     low = 0.8 * max(min(float(value.min()) for value in positive), best / 100)
     high = 1.25 * min(highest, LEAVES_THE_FRAME * best)
-    ax.set_yscale("log")
-    ax.set_ylim(low, high)
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 3000 * low else (1,)))
-    ax.yaxis.set_major_formatter(plain_numbers())
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    _set_log_scale(ax, low, high)
     return [name for name, value in values.items() if (value > high).any()]
 
 
@@ -189,14 +185,27 @@ def _scale_ratio(ax: Axes, curves: Mapping[str, Curve]) -> list[str]:
     ]
     low = min(1.0, *(float(np.nanquantile(value, 0.02)) for value in near))
     high = max(1.0, *(float(np.nanquantile(value, 0.98)) for value in near))
-    room = 0.08 * max(high - low, 1e-3)
-    ax.set_ylim(low - room, high + room)
-    ax.yaxis.set_major_formatter(plain_numbers())
+    if high > LOG_SCALE_RATIO:
+        low, high = max(low, 1e-3) / 1.2, 1.2 * high
+        _set_log_scale(ax, low, high)
+    else:
+        room = 0.08 * max(high - low, 1e-3)
+        low, high = low - room, high + room
+        ax.set_ylim(low, high)
+        ax.yaxis.set_major_formatter(plain_numbers())
     return [
         name
         for name, curve in curves.items()
-        if ((curve.value < low - room) | (curve.value > high + room)).mean() > 0.05
+        if ((curve.value < low) | (curve.value > high)).mean() > 0.05
     ]
+
+
+def _set_log_scale(ax: Axes, low: float, high: float) -> None:
+    ax.set_yscale("log")
+    ax.set_ylim(low, high)
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 3000 * low else (1,)))
+    ax.yaxis.set_major_formatter(plain_numbers())
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _over(curves: Iterable[Curve], runs: int) -> str:

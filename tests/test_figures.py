@@ -333,6 +333,15 @@ def test_ratios_to_one_estimator_make_small_differences_visible():
     assert_nothing_hidden(figure)
 
 
+def test_ratios_over_several_powers_of_ten_are_logarithmic():
+    steps, tracks, information = with_ratios()
+    late = (steps["metric"] == "velocity_mse_ratio") & (steps["step"] > 90)
+    steps.loc[late, "value"] = 300.0
+    position, velocity = draw(steps, tracks, information)["error_ratio"].axes
+    assert (position.get_yscale(), velocity.get_yscale()) == ("linear", "log")
+    assert velocity.get_ylim()[0] < 1.0 < 300.0 < velocity.get_ylim()[1]
+
+
 def test_without_a_reference_there_are_no_ratios():
     steps, tracks, information = with_ratios()
     assert "error_ratio" not in draw(steps, tracks, information._replace(compare_with=None))
