@@ -177,7 +177,7 @@ def run(
     interrupted one: whole shards (2,048 runs of one case) are kept.
     """
     from hybridtrack import experiment as experiments
-    from hybridtrack import results
+    from hybridtrack import pictures, results
     from hybridtrack.executors import available_cores
     from hybridtrack.progress import progress
 
@@ -195,11 +195,11 @@ def run(
             _interrupted(_what_is_kept(folder))
     elif not quiet:
         _say_complete(folder, experiment.runs)
-    if not figures_are_drawn(folder):
+    if not pictures.are_drawn(folder):
         if not quiet:
             say("drawing figures")
         try:
-            draw_figures(folder)
+            pictures.draw_run(folder)
         except Interrupted:
             _interrupted(f"; {folder} is complete but for figures: the same command draws them")
     print_run(folder, json)
@@ -245,40 +245,6 @@ def _say_if_compiling() -> None:
             "compiling the kernels, once for this version: ten to twenty seconds (an interruption "
             "waits for it)"
         )
-
-
-def draw_figures(folder: Path) -> list[Path]:
-    """Draw a finished run's figures from its tables alone, and note in its manifest which."""
-    import json as encoder
-
-    from hybridtrack import figures, results
-
-    manifest = results.require_complete(folder)
-    information = figures.RunInformation(
-        title=manifest["title"],
-        runs=manifest["runs"],
-        estimators=tuple(manifest["estimators"]),
-        modes=tuple(manifest["modes"]),
-        error=manifest["error"],
-        compare_with=manifest["compare_with"],
-    )
-    steps, tracks, reliability = (
-        results.read_columns(folder, name) for name in ("steps", "tracks", "reliability")
-    )
-    drawn = figures.draw(steps, tracks, information, reliability)
-    paths = figures.save(drawn, folder / "figures")
-    noted = manifest | {"figures": [path.name for path in paths]}
-    if noted != manifest and results.read_manifest(folder) == manifest:  # nobody went on meanwhile
-        results.write_text(folder / results.MANIFEST, encoder.dumps(noted, indent=2) + "\n")
-    return paths
-
-
-def figures_are_drawn(folder: Path) -> bool:
-    """Whether all figures of the tables as they are were drawn, and are still there."""
-    from hybridtrack.results import require_complete
-
-    names = require_complete(folder).get("figures")
-    return isinstance(names, list) and all((folder / "figures" / str(n)).exists() for n in names)
 
 
 def print_run(folder: Path, json: bool) -> None:
@@ -374,26 +340,18 @@ def plot(
     """
     if run_dir is not None and chain is not None:
         raise UserError(f"{run_dir} and --chain {chain} are two things to draw; give one of them")
+    from hybridtrack import pictures
+
     if chain is not None:
-        paths = draw_chains(chain, out)
+        paths = pictures.draw_chains(chain, out)
     elif run_dir is None:
         raise UserError("there is nothing to draw; give a run folder, or a scenario to --chain")
     elif out is not None:
         raise UserError(f"--out {out}: a run's figures go to its own folder; leave --out away")
     else:
-        paths = draw_figures(run_dir)
+        paths = pictures.draw_run(run_dir)
     for path in paths:
         print(path)
-
-
-def draw_chains(config: str, out: Path | None) -> list[Path]:
-    """Draw the state transition diagrams of a scenario's Markov chains."""
-    from hybridtrack import diagrams, figures
-    from hybridtrack.config import load
-
-    experiment = load(config)
-    drawn = diagrams.draw(diagrams.chains(experiment), experiment.title)
-    return figures.save(drawn, out or Path("runs") / f"{experiment.name}-chain")
 
 
 @command("hybridtrack list", "hybridtrack list motions", name="list")
