@@ -3,7 +3,7 @@
 from hybridtrack.config import shipped
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
-from hybridtrack.statistics import METRICS
+from hybridtrack.statistics import CALIBRATION, METRICS
 
 
 def catalogue() -> dict[str, dict[str, str]]:
@@ -12,7 +12,8 @@ def catalogue() -> dict[str, dict[str, str]]:
         "estimators": {name: e.summary for name, e in estimators().items()},
         "motions": {name: m.summary.rstrip(".") for name, m in MOTION_MODELS.items()},
         "analyses": {},
-        "metrics": {name: m.summary for name, m in METRICS.items()},
+        "metrics": {name: m.summary for name, m in METRICS.items()}
+        | {CALIBRATION: "mean distance of that probability from how often it came true (ECE)"},
         "scenarios": {name: _title(name) for name in shipped()},
     }
 

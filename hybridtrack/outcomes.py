@@ -14,6 +14,7 @@ from hybridtrack.config import Experiment
 from hybridtrack.errors import UserError
 from hybridtrack.simulation import BLOCK_RUNS
 from hybridtrack.statistics import (
+    CALIBRATION,
     METRICS,
     POSITION,
     POSITION_AT_SCANS,
@@ -203,8 +204,6 @@ def _columns(table: str, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
     names = columns.SCHEMAS[table].names
     return {name: [row[i] for row in rows] for i, name in enumerate(names)}
 
-
-CALIBRATION = "final_mode_calibration_error"
 
 Pair = tuple[str, str, str]  # first and second estimator, window
 

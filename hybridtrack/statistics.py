@@ -72,6 +72,9 @@ METRICS: Mapping[str, Metric] = {
     ),
 }
 
+# A figure of a whole window, not a mean over its runs and steps; see reliability.
+CALIBRATION = "final_mode_calibration_error"
+
 # The position error at the scans that were not missed: what compares with the measurements.
 POSITION, POSITION_AT_SCANS = "position_squared_error_m2", "position_squared_error_at_scans_m2"
 VELOCITY = "velocity_squared_error_m2_s2"
