@@ -25,6 +25,11 @@ ERRORS = {
     ),
 }
 MODES = (("mode_accuracy", "mode\naccuracy"), ("mode_brier", "Brier\nscore"))
+FINAL_MODE = (
+    ("final_mode_brier", "Brier\nscore"),
+    ("final_mode_prior_brier", "by the\ntime alone"),
+    ("final_mode_calibration_error", "calibration\nerror"),
+)
 MOST_DECIMALS = 6  # more than that, and figures of a million on, take an exponent
 MOST_DIGITS = 6  # of a figure with an exponent, after its point
 SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
@@ -83,11 +88,16 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     over = f" in each of {cases} cases" if cases > 1 else ""
     yield Text(f"{manifest['title']}: {counted(runs, 'run')}{over}, seed {manifest['seed']}\n")
     shown = (*ERRORS[manifest["error"]], *MODES)
-    yield _summary(summary, manifest["estimators"], shown)
+    yield _summary("estimator", summary, ["raw", *manifest["estimators"]], shown)
     comparisons = results.read_rows(path, "comparisons")
     if comparisons:
         yield ""
         yield _ratios(comparisons, manifest["compare_with"], shown)
+    told = {row["estimator"] for row in summary if row["metric"] == FINAL_MODE[0][0]}
+    if told:
+        yield ""
+        labels = [label for label in manifest["estimators"] if label in told]
+        yield _summary("mode is the last", summary, labels, FINAL_MODE)
     for label, count in manifest.get("diverged", {}).items():
         yield Text(
             f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
@@ -120,13 +130,13 @@ def _plain_table() -> Table:
 Columns = tuple[tuple[str, str], ...]  # metrics and their headings
 
 
-def _summary(summary: Rows, estimators: list[str], shown: Columns) -> Table:
+def _summary(heading: str, summary: Rows, labels: list[str], shown: Columns) -> Table:
     figures = {
         (row["estimator"], row["metric"]): figure(row["value"], row["standard_error"])
         for row in summary
         if row["window"] == "all"
     }
-    return _by_metric("estimator", ["raw", *estimators], figures, shown)
+    return _by_metric(heading, labels, figures, shown)
 
 
 def _ratios(comparisons: Rows, reference: str, shown: Columns) -> Table:

@@ -166,3 +166,21 @@ def test_squared_errors_are_shown_where_the_scenario_asks(folder):
     assert "MSE, m²/s²" in text
     assert "RMS" not in text
     assert "123456.789±0.001" in text
+
+
+def test_the_scores_of_the_last_mode_have_a_table_of_their_own(folder):
+    assert "mode is the last" not in shown(folder, 80)
+    told = [
+        (LONG, "final_mode_brier", "all", 0.0833, 0.0004, 100),
+        (LONG, "final_mode_prior_brier", "all", 0.1162, 0.0009, 100),
+        (LONG, "final_mode_calibration_error", "all", 0.0103, 0.0007, 100),
+    ]
+    rows = results.read_rows(folder, "summary")
+    names = results.SCHEMAS["summary"].names
+    rows += [dict(zip(names, row, strict=True)) for row in told]
+    table = results.pa.Table.from_pylist(rows, schema=results.SCHEMAS["summary"])
+    results.pq.write_table(table, folder / "summary.parquet")
+    text = shown(folder, 200)
+    assert "mode is the last" in text
+    line = next(line for line in text.splitlines() if "0.0833" in line)
+    assert line.split()[1:] == ["0.0833±0.0004", "0.1162±0.0009", "0.0103±0.0007"]
