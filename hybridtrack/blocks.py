@@ -144,20 +144,21 @@ def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) ->
 
 
 @functools.lru_cache(maxsize=64)
-def _even_model(bank: Itself, step_s: float, covariance: bytes) -> JumpMarkovModel:
-    """The model of steps of one length, which blocks have in common."""
+def _model_of_one(bank: Itself, step_s: float, covariance: bytes, even: bool) -> JumpMarkovModel:
+    """The model of a step, and of all where they are even; blocks have it in common."""
     one: ModeBank = bank.one
     n_x = len(one.state_names)
     initial = np.frombuffer(covariance).reshape(n_x, n_x)
-    return one.discretise(np.array([step_s]), np.zeros(n_x), initial)
+    model = one.discretise(np.array([step_s]), np.zeros(n_x), initial)
+    return model._replace(even_steps=even)
 
 
 @functools.lru_cache(maxsize=64)
-def _prepared_for_even_steps(
-    bank: Itself, step_s: float, covariance: bytes, estimator: Itself, settings: Any
+def _prepared_for_one(
+    bank: Itself, step_s: float, covariance: bytes, even: bool, estimator: Itself, settings: Any
 ) -> Any:
-    """An estimator for such steps, which blocks have in common too."""
-    return estimator.one.prepare(settings, _even_model(bank, step_s, covariance))
+    """An estimator for such a step, which blocks have in common too."""
+    return estimator.one.prepare(settings, _model_of_one(bank, step_s, covariance, even))
 
 
 class _Block:
@@ -181,7 +182,7 @@ class _Block:
         )
         self._step_s = step_lengths(self._case.times_s)
         self._steps_are_even = bool((self._step_s == self._step_s[0]).all())
-        self._even: dict[str, Any] = {}
+        self._first: dict[str, Any] = {}  # for all steps, where they are even
         self._running: dict[str, AtWork] = {}
         chosen = experiment.estimators
         self._told = {c.label for c in chosen if c.estimator.is_told_modes(c.settings)}
@@ -267,10 +268,11 @@ class _Block:
         self._initial_covariances = covariances
         for chosen in experiment.estimators:
             covariance = np.ascontiguousarray(covariances[id(chosen.bank)], dtype=np.float64)
-            self._even[chosen.label] = _prepared_for_even_steps(
+            self._first[chosen.label] = _prepared_for_one(
                 Itself(chosen.bank),
                 float(self._step_s[0]),
                 covariance.tobytes(),
+                self._steps_are_even,
                 Itself(chosen.estimator),
                 chosen.settings,
             )
@@ -278,20 +280,21 @@ class _Block:
         for chosen in sorted(
             experiment.estimators, key=lambda c: c.label != experiment.compare_with
         ):
-            prepared = self._even[chosen.label]
+            prepared = self._first[chosen.label]
             self._running[chosen.label] = chosen.estimator.begin(chosen.settings, prepared, mean)
 
     def _prepared(self, span: slice) -> dict[str, Any]:
         """Each estimator for the steps of a span; estimators of one bank share its matrices."""
         if self._steps_are_even:
-            return self._even
+            return self._first
         nothing = np.zeros(len(self._experiment.bank.state_names))
         built: dict[int, JumpMarkovModel] = {}
         for chosen in self._experiment.estimators:
             bank = chosen.bank
             if id(bank) not in built:
                 start = self._initial_covariances[id(bank)]
-                built[id(bank)] = bank.discretise(self._step_s[span], nothing, start)
+                model = bank.discretise(self._step_s[span], nothing, start)
+                built[id(bank)] = model._replace(even_steps=False)
         return {
             c.label: c.estimator.prepare(c.settings, built[id(c.bank)])
             for c in self._experiment.estimators

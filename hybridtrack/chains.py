@@ -23,7 +23,8 @@ class Supermodes(NamedTuple):
     stage: Indices  # (n_supermodes,) 1 where ended; how many transitions there have been
     transition_matrix: Array  # (n_times, n_supermodes, n_supermodes)
     initial_probabilities: Array  # (n_supermodes,)
-    final_probability: Array  # (n_times, n_supermodes) that the mode now is the last one
+    # (n_times, n_supermodes) that the mode now is the last one, if later steps are as long
+    final_probability: Array
 
 
 class Bound(NamedTuple):
@@ -66,8 +67,7 @@ def soft_bound(
     before it is left. The leak is a guard and no belief, so it has no part in this.
     """
     n_times, n, _ = transition_matrix.shape
-    stays = np.diagonal(transition_matrix, axis1=1, axis2=2)
-    left = continuation_probability * (1.0 - stays)
+    left = continuation_probability * leaving_probability(transition_matrix)
     ends = 1.0 - continuation_probability
     final = np.divide(ends, ends + left, out=np.ones_like(left), where=ends + left > 0.0)
     same = np.eye(n)
@@ -118,10 +118,16 @@ def hard_bound(
     )
 
 
+def leaving_probability(transition_matrix: Array) -> Array:
+    """The probability (..., n) of leaving each mode in a step; exactly 0 where none leads away."""
+    n = transition_matrix.shape[-1]
+    leaving: Array = np.where(np.eye(n, dtype=bool), 0.0, transition_matrix).sum(axis=-1)
+    return leaving
+
+
 def _never_left(transition_matrix: Array) -> Array:
     """1 for a mode that stays for ever, 0 for one that is left some time (n_times, n)."""
-    stays = np.diagonal(transition_matrix, axis1=1, axis2=2)
-    return np.where(stays == 1.0, 1.0, 0.0)
+    return np.where(leaving_probability(transition_matrix) == 0.0, 1.0, 0.0)
 
 
 def expected_steps_to_end(continuation_probability: float) -> float:
@@ -132,7 +138,7 @@ def expected_steps_to_end(continuation_probability: float) -> float:
 
 def expected_steps_in_mode(transition_matrix: Array) -> Array:
     """Steps from entering a mode to leaving it, 1/(1 - p_ii); transition_matrix (n, n)."""
-    leaving = 1.0 - np.diagonal(transition_matrix)
+    leaving = leaving_probability(transition_matrix)
     return np.divide(1.0, leaving, out=np.full_like(leaving, np.inf), where=leaving > 0.0)
 
 
@@ -145,12 +151,19 @@ def expected_transitions(supermodes: Supermodes) -> float:
     matrix, mode = chain.transition_matrix[0], chain.mode
     passing = np.flatnonzero(chain.final_probability[0] < 1.0)
     among = matrix[np.ix_(passing, passing)]
+    # I - T with 1 - p_ii as the sum of all that leads away, which keeps its digits.
+    passed = -among
+    np.fill_diagonal(passed, leaving_probability(matrix)[passing])
     if passing.size == 0:
         return 0.0
-    if np.abs(np.linalg.eigvals(among)).max() >= 1.0 - 1e-12:  # never done
+    leads = matrix != 0.0
+    ends = chain.final_probability[0] == 1.0
+    for _ in range(ends.size):
+        ends = ends | leads[:, ends].any(axis=1)
+    if not ends.all():  # the mode changes for ever, from some time on
         return math.inf
     start = chain.initial_probabilities[passing]
-    visits = np.linalg.solve(np.eye(passing.size) - among.T, start)
+    visits = np.linalg.solve(passed.T, start)
     changes = np.where(mode[passing, np.newaxis] != mode, matrix[passing], 0.0).sum(axis=1)
     return float(visits @ changes)
 
@@ -183,5 +196,5 @@ def on_supermodes(model: JumpMarkovModel, supermodes: Supermodes) -> JumpMarkovM
         transition_matrix=supermodes.transition_matrix,
         initial_mode_probabilities=supermodes.initial_probabilities,
         mode_names=tuple(model.mode_names[j] for j in mode),
-        final_probability=supermodes.final_probability,
+        final_probability=supermodes.final_probability[0] if model.even_steps else None,
     )

@@ -50,7 +50,8 @@ class JumpMarkovModel(NamedTuple):
     step_s: Array  # (n_times or 1,)
     mode_names: tuple[str, ...]
     state_names: tuple[str, ...]
-    # (n_times or 1, n_modes) that the mode now is the last one; None where that isn't asked
+    even_steps: bool = True  # whether all steps are of one length, those of other spans too
+    # (n_modes,) that the mode now is the last one; None where nothing can be said of it
     final_probability: Array | None = None
 
     def only(self, mode: str) -> "JumpMarkovModel":

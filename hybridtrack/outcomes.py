@@ -19,6 +19,7 @@ from hybridtrack.statistics import (
     POSITION,
     POSITION_AT_SCANS,
     QUANTITIES,
+    VELOCITY,
     Estimate,
     Metric,
     Moments,
@@ -114,7 +115,7 @@ def steps_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[str
     for case, group in zip(experiment.cases, cases, strict=True):
         times_s = case.times_s[1:]
         for (label, quantity), moments in group.steps.items():
-            if quantity.endswith(DIFFERENCE):
+            if quantity in (POSITION + DIFFERENCE, VELOCITY + DIFFERENCE):  # a mode may end so too
                 of = quantity.removesuffix(DIFFERENCE)
                 for metric, numbers in _ratio_rows(experiment, group, label, of):
                     texts = {"case": case.name, "estimator": label, "metric": metric}
@@ -181,7 +182,8 @@ def summary_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
                 if not math.isnan(estimate.value):
                     rows.append((label, name, window.name, *estimate))
     for label, found in _reliabilities(experiment, cases).items():
-        rows.append((label, CALIBRATION, experiment.windows[0].name, *found.calibration_error))
+        if not math.isnan(found.calibration_error.value):
+            rows.append((label, CALIBRATION, experiment.windows[0].name, *found.calibration_error))
     return _columns("summary", rows)
 
 

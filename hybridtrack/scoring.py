@@ -290,7 +290,7 @@ def score_final_mode(brier, prior_brier, probability, prior, final):
     """Squared errors of the posterior and of the prior; final (lanes,), or (1,)."""
     for b in range(brier.size):
         brier[b] = probability[b]
-        prior_brier[b] = prior
+        prior_brier[b] = prior if probability[b] == probability[b] else np.nan
     if final.size == 1:
         for b in range(brier.size):
             brier[b] -= final[0]

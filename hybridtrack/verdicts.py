@@ -4,8 +4,8 @@ A claim is a figure ("IMM position RMS is 18 m") or a comparison ("RMIMM has the
 a metric of a run; or a figure that follows from the scenario alone ("50 steps on average"). A
 figure is met if ours, give or take K standard errors, lies within what the printed digits can mean;
 a comparison holds if the paired difference has the claimed sign by more than K standard errors, or
-if the paired ratio of two that are said to be equal is 1 within the scenario's tolerance. Agreement
-within an error wider than the printed digits decides nothing.
+if the paired ratio of two that are said to be equal, give or take as much, is 1 within the
+scenario's tolerance. Agreement within an error wider than the printed digits decides nothing.
 The error is itself estimated from the runs: where these are few, Student's quantile of the same
 probability stands for K, and one run decides nothing. A window that holds no step, or no run that
 didn't diverge, leaves nothing to judge.
@@ -94,7 +94,7 @@ def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
     """
     assert claim.sign is not None
     if claim.sign == "equal":
-        return _outcome(claim, ours.ratio, _figure(claim, ours.ratio, assumptions))
+        return _outcome(claim, ours.ratio, _equality(claim, ours.ratio, assumptions))
     figure = ours.ratio if claim.value is not None else ours.difference
     verdict = _sign(claim, ours.difference)
     if verdict == REPRODUCED and claim.value is not None:
@@ -120,6 +120,14 @@ def _figure(claim: Claim, ours: Estimate, assumptions: bool) -> str:
     if allowed <= claim.tolerance:
         return ASSUMED if assumptions else REPRODUCED
     return _undecided(ours)
+
+
+def _equality(claim: Claim, ratio: Estimate, assumptions: bool) -> str:
+    """All that chance may do has to lie within the tolerance, which is no rounding here."""
+    distance, allowed = abs(ratio.value - 1.0), _allowed(ratio)
+    if distance + allowed <= claim.tolerance:
+        return ASSUMED if assumptions else REPRODUCED
+    return NOT_REPRODUCED if distance - allowed > claim.tolerance else _undecided(ratio)
 
 
 def _undecided(ours: Estimate) -> str:

@@ -49,6 +49,7 @@ def random_model(rng, n_modes=3, n_x=4, n_y=2, n_times=1):
         step_s=np.ones(n_times),
         mode_names=tuple(f"m{j}" for j in range(n_modes)),
         state_names=tuple(f"s{e}" for e in range(n_x)),
+        even_steps=n_times == 1,
     )
 
 

@@ -28,6 +28,7 @@ from models import figure_5_model, random_model, run_kernel
 
 MATRIX = np.array([[[0.7, 0.2, 0.1], [0.3, 0.6, 0.1], [0.05, 0.15, 0.8]]])
 START = np.array([0.5, 0.3, 0.2])
+EVEN = np.array([0.5, 0.5])
 
 ROUNDING = 1e-10  # relative: some 1e4 operations at 1e-16 each, and a margin of 100
 ASKED = 1e-8  # what the filters' ends are asked to meet; rounding is far below
@@ -145,6 +146,24 @@ def test_a_leak_is_no_belief_that_modes_go_on():
     np.testing.assert_array_equal(with_leak.final_probability, without.final_probability)
 
 
+def test_rows_that_sum_to_one_but_for_rounding_are_never_left_where_nothing_leads_away():
+    rounded = np.array([[[1.0 - 1e-10, 0.0], [0.3, 0.7]]])
+    start = np.array([0.5, 0.5])
+    for bound in (Bound(), Bound(continuation_probability=0.9), Bound(most_transitions=2)):
+        chain = bound.supermodes(rounded, start)
+        assert (chain.final_probability[0, chain.mode == 0] == 1.0).all()
+        assert expected_transitions(chain) < 1.0
+
+
+def test_uneven_steps_tell_nothing_of_the_last_mode():
+    """What comes is another chain than what was; a filter that foresaw it would be wrong."""
+    model = random_model(np.random.default_rng(5), n_times=4)
+    bounded, recursion = bound_filter("sbf", model, continuation_probability=0.9)
+    assert bounded.final_probability is None
+    found, _ = run_kernel(bounded, scans(6, 4, scale=3.0), recursion)
+    assert found.final_mode_probability.size == found.final_mode_prior.size == 0
+
+
 def test_the_last_mode_in_example_1_of_sigalov():
     """q = (1 - p0)/(1 - p0 + p0 (1 - p_ii)) = 0.2033 where not ended."""
     chain = soft_bound(np.array([[[0.92, 0.08], [0.08, 0.92]]]), np.array([1.0, 0.0]), 0.98)
@@ -184,6 +203,7 @@ def test_expected_times_and_numbers_of_sigalovs_example():
     [
         (soft_bound(MATRIX, START, 0.9), None),
         (hard_bound(MATRIX, START, 3), 3.0),
+        (hard_bound(np.array([[[1.0 - 1e-13, 1e-13], [1e-13, 1.0 - 1e-13]]]), EVEN, 4), 4.0),
         (hard_bound(ABSORBING, START, 3), None),
         (hard_bound(MATRIX, START, 0), 0.0),
         (soft_bound(MATRIX, START, 1.0), math.inf),
@@ -211,7 +231,7 @@ def test_filters_tell_how_likely_the_mode_is_the_last_one(name):
     bounded, recursion = bound_filter(name, model, **settings)
     z = scans(6, 20, scale=3.0)
     found, _ = run_kernel(bounded, z, recursion)
-    final = bounded.final_probability[0]
+    final = bounded.final_probability
     for k, (_, _, mu, _) in enumerate(reference.bank(bounded, z[:, :, 0])):
         assert found.final_mode_probability[k, 0] == pytest.approx(mu @ final, rel=ROUNDING)
     estimator = estimators()[name]

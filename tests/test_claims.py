@@ -81,6 +81,8 @@ def test_a_bound_is_a_figure_with_a_sign(tmp_path):
             "'mode' belongs to a claim with 'fig",
         ),
         ("estimator: SBF, value: 1", "'metric' is missing in this claim; add it"),
+        (f"compare: [SBF, HBF], {METRIC}, sign: equal, value: 2", "'value' of two that are equal"),
+        (f"estimator: SBF, {METRIC}", "'value' is missing in this claim on one"),
         (f"compare: [SBF, HBF], {METRIC}, sign: equal", "'tolerance' is missing: how far from 1"),
         (
             "estimator: IMM, metric: final_mode_brier, value: 1",

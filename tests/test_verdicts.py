@@ -57,10 +57,12 @@ def equal(ratio, error, *, tolerance=0.05, value=1.0, assumptions=False):
     [
         (1.02, 0.001, REPRODUCED),
         (0.98, 0.001, REPRODUCED),
-        (1.05, 0.016, REPRODUCED),  # three errors are .048
-        (1.05, 0.017, UNDECIDED),  # three errors are .051, wider than what is called equal
+        (1.02, 0.0099, REPRODUCED),  # three errors are .0297
+        (1.02, 0.0101, UNDECIDED),  # three errors reach beyond what is called equal
+        (1.05, 0.001, UNDECIDED),
         (1.06, 0.001, NOT_REPRODUCED),
         (0.94, 0.001, NOT_REPRODUCED),
+        (1.09, 0.016, UNDECIDED),
         (1.06, 0.02, UNDECIDED),
     ],
 )

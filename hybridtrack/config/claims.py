@@ -39,7 +39,7 @@ def built_claim(
             (*path, "sign"), f"'sign' {claim.sign} has no place in this claim; remove it"
         )
     figure = claim.figure if claim.mode is None else f"{claim.figure} of {claim.mode}"
-    value = 1.0 if claim.sign == "equal" and claim.value is None else claim.value
+    value = 1.0 if claim.sign == "equal" else claim.value
     return Claim(
         claim=claim.claim,
         estimator=claim.estimator,
@@ -93,7 +93,10 @@ def _check_of_runs(
         raise document.error(
             path, "'sign' is missing in this comparison; add less, greater or equal"
         )
-    if claim.compare is not None and claim.sign == "equal" and claim.tolerance is None:
+    equal = claim.compare is not None and claim.sign == "equal"
+    if equal and claim.value is not None:
+        raise document.error((*path, "value"), "'value' of two that are equal is 1; remove it")
+    if equal and claim.tolerance is None:
         raise document.error(
             path, "'tolerance' is missing: how far from 1 may the ratio of two that are equal be?"
         )

@@ -7,7 +7,7 @@ import numpy as np
 from hybridtrack.estimators import Estimator
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.sensors import Sensor
-from hybridtrack.simulation import Case
+from hybridtrack.simulation import Case, step_lengths
 from hybridtrack.verdicts import Claim
 
 
@@ -66,6 +66,10 @@ class Experiment(NamedTuple):
 
     @property
     def foresees(self) -> bool:
-        """Whether an estimator tells how likely the mode now is the last, and the truth knows."""
+        """Whether an estimator tells how likely the mode now is the last, and the truth knows.
+
+        None does where steps are uneven: what comes after a step is another chain than before it.
+        """
         bounds = [chosen.estimator.bound(chosen.settings) for chosen in self.estimators]
-        return any(bound.is_set for bound in bounds) and bool(self.truth_modes)
+        told = any(bound.is_set for bound in bounds) and bool(self.truth_modes)
+        return told and all(not np.ptp(step_lengths(case.times_s)) for case in self.cases)

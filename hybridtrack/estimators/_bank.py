@@ -258,10 +258,9 @@ def advance(bank_state, workspace, model, choices, measurements, known_modes, es
                         total += state.mode_probabilities[j]
                 store(estimates.mode_probabilities[k, o], g, total)
             if estimates.final_mode_probability.shape[0]:
-                final = model.final_probability[k if model.final_probability.shape[0] > 1 else 0]
                 total = repeat(0.0)
                 for j in range(n_modes):
-                    total += final[j] * state.mode_probabilities[j]
+                    total += model.final_probability[j] * state.mode_probabilities[j]
                 store(estimates.final_mode_probability[k], g, total)
         for j in range(n_modes):  # for a next span, in which it may have an only origin
             if not model.keeps_logarithm[j]:
@@ -276,13 +275,12 @@ def foresee(prior, scratch, model, out):
     """
     for k in range(out.shape[0]):
         transition = model.transition_matrix[k if model.transition_matrix.shape[0] > 1 else 0]
-        final = model.final_probability[k if model.final_probability.shape[0] > 1 else 0]
         total = 0.0
         for j in range(prior.size):
             scratch[j] = 0.0
             for i in range(prior.size):
                 scratch[j] += transition[i, j] * prior[i]
-            total += final[j] * scratch[j]
+            total += model.final_probability[j] * scratch[j]
         for j in range(prior.size):
             prior[j] = scratch[j]
         out[k, 0] = total

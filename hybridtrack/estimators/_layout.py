@@ -44,7 +44,7 @@ class KernelModel(NamedTuple):
     decorrelated_variance: Array  # D (n_modes, n_y)
     component: Indices  # (n_modes, n_y) the one state in a row of L^-1 H; -1: several
     output_mode: Indices  # (n_modes,) where a mode's probability is added
-    final_probability: Array  # (n_times or 1, n_modes); (0, n_modes) where it isn't asked
+    final_probability: Array  # (n_modes,); (0,) where there is none
 
 
 class BankState(NamedTuple):
@@ -241,7 +241,7 @@ def kernel_model(model: JumpMarkovModel) -> KernelModel:
         component=_only_nonzero(decorrelated),
         output_mode=np.array([names.index(name) for name in model.mode_names], dtype=np.int64),
         final_probability=(
-            np.zeros((0, n_modes))
+            np.zeros(0)
             if model.final_probability is None
             else np.ascontiguousarray(model.final_probability)
         ),

@@ -31,7 +31,7 @@ class Chain(NamedTuple):
     transition_matrix: Array  # (n_times or 1, n_supermodes, n_supermodes)
     log_origins: SparseMaps  # logarithms of its transpose: a row for where a supermode comes from
     log_members: SparseMaps  # logarithms of 1: a row for the supermodes of a mode
-    final_probability: Array  # (n_times or 1, n_supermodes); (0, n_supermodes) where not bounded
+    final_probability: Array  # (n_supermodes,); (0,) where nothing can be said of it
 
 
 class Sequences(NamedTuple):
@@ -179,7 +179,6 @@ def combine(b, k, sequences, tree, work, chain, estimates):
     n_groups = -(-sequences.kept[b] // WIDTH)
     mean, covariance = vectors(sequences.mean)[b], vectors(sequences.covariance)[b]
     log_weight, weight = vectors(sequences.log_weight)[b], vectors(tree.weight)
-    final_time = k if chain.final_probability.shape[0] > 1 else 0
     bounded = estimates.final_mode_probability.shape[0] > 0
     everything, final = repeat(0.0), repeat(0.0)
     for j in range(n_modes):
@@ -193,7 +192,7 @@ def combine(b, k, sequences, tree, work, chain, estimates):
             total += share
             work.weight[chain.mode[s]] = work.weight[chain.mode[s]] + share
             if bounded:
-                final += chain.final_probability[final_time, s] * share
+                final += chain.final_probability[s] * share
         weight[g] = total
         everything += total
         for e in range(n_x):

@@ -142,6 +142,7 @@ class BestSequences:
                 "remove one"
             )
         found = bound.supermodes(model.transition_matrix, model.initial_mode_probabilities)
+        told = bound.is_set and model.even_steps
         members = found.mode == np.arange(len(model.mode_names))[:, np.newaxis]
         chain = Chain(
             mode=found.mode,
@@ -149,13 +150,11 @@ class BestSequences:
             transition_matrix=np.ascontiguousarray(found.transition_matrix),
             log_origins=_in_logarithms(np.swapaxes(found.transition_matrix, 1, 2)),
             log_members=_in_logarithms(members[np.newaxis].astype(np.float64)),
-            final_probability=np.ascontiguousarray(
-                found.final_probability[: None if bound.is_set else 0]
-            ),
+            final_probability=found.final_probability[0] if told else np.zeros(0),
         )
         kernel = kernel_model(model)
-        if bound.is_set:  # for the room of the estimates
-            model = model._replace(final_probability=found.final_probability)
+        if told:  # for the room of the estimates
+            model = model._replace(final_probability=found.final_probability[0])
         return Prepared(kernel, chain, model)
 
     def begin(self, settings: Settings, prepared: Prepared, initial_mean: Array) -> Running:
