@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.config import Experiment, Window
+from hybridtrack.errors import Stopped
 from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates
-from hybridtrack.executors import Stopped
 from hybridtrack.models import Array, Itself, JumpMarkovModel, ModeBank
 from hybridtrack.roots import square_root
 from hybridtrack.scoring import Given, Names, all_below, as_measured, blank_sheet
@@ -209,7 +209,7 @@ class _Block:
                 raise Stopped
             scans = self._simulation.advance(span)
             if not self._running:
-                self._start(scans)
+                self._start(scans, stop)
             if self._held is None:
                 self._note_shares(span, scans.truth)
             self._keep_truth(span, scans)
@@ -245,7 +245,7 @@ class _Block:
 
     # ---- the filters' start ----
 
-    def _start(self, scans: Scans) -> None:
+    def _start(self, scans: Scans, stop: threading.Event) -> None:
         experiment, initial = self._experiment, self._experiment.initial
         states = experiment.bank.state_names
         mean = np.repeat(initial.mean[:, np.newaxis], self._lanes, axis=1)
@@ -281,7 +281,9 @@ class _Block:
             experiment.estimators, key=lambda c: c.label != experiment.compare_with
         ):
             prepared = self._first[chosen.label]
-            self._running[chosen.label] = chosen.estimator.begin(chosen.settings, prepared, mean)
+            self._running[chosen.label] = chosen.estimator.begin(
+                chosen.settings, prepared, mean, stop
+            )
 
     def _prepared(self, span: slice) -> dict[str, Any]:
         """Each estimator for the steps of a span; estimators of one bank share its matrices."""

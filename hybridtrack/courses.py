@@ -33,6 +33,7 @@ from hybridtrack.page import (
 
 LOG_SCALE_RATIO = 15.0
 LEAVES_THE_FRAME = 1e5  # a curve this many times the best one's median has nothing left to tell
+RATIO_LOG_SCALE = 5.0
 HOPELESS = 100.0  # a curve whose own median is so many times the best's is named, not drawn
 NEARLY_AS_GOOD = 1.3  # ratios whose median is within this of the best's make the frame
 TRUE_MODE_COLOUR, SWITCH_COLOUR = "0.88", "0.6"
@@ -85,22 +86,25 @@ def draw_ratios(case: Case, looks: Looks, information: RunInformation) -> Figure
     if not drawn or information.compare_with is None:
         return None
     figure, axes = panels(len(drawn), 1, 0.4 + 2.1 * len(drawn), sharey=False)
-    leaving: dict[str, None] = {}
+    leaving: dict[str, list[str]] = {}
     for ax, quantity in zip(axes, drawn, strict=True):
         curves, beyond = _worth_drawing(drawn[quantity])
         drawn[quantity] = curves
         ax.axhline(1.0, color=TRUTH_COLOUR, linewidth=0.7, zorder=0.5)
+        leaves = beyond + _scale_ratio(ax, curves)
         for name, curve in curves.items():
-            plot_curve(ax, curve, looks[name])
+            if _is_inside(ax, curve):
+                plot_curve(ax, curve, looks[name])
         _mark_switches(ax, switch_times(case.truth))
-        leaving |= dict.fromkeys(beyond + _scale_ratio(ax, curves))
+        leaving |= {name: [*leaving.get(name, []), quantity] for name in leaves}
         ax.set_ylabel(f"{quantity} error ratio")
     every = [curve for curves in drawn.values() for curve in curves.values()]
     _frame_time(axes[-1:], every, case.truth)
     name = ERROR_NAMES[information.error]
     caption = f"Ratio of {name} errors to {information.compare_with}'s, over the same "
     caption += _over(every, information.runs).removeprefix("over ")
-    finish(figure, case.title, caption, leaving)
+    gone = [n if len(k) == len(drawn) else f"{n} ({', '.join(k)})" for n, k in leaving.items()]
+    finish(figure, case.title, caption, gone)
     return figure
 
 
@@ -185,7 +189,7 @@ def _scale_ratio(ax: Axes, curves: Mapping[str, Curve]) -> list[str]:
     ]
     low = min(1.0, *(float(np.nanquantile(value, 0.02)) for value in near))
     high = max(1.0, *(float(np.nanquantile(value, 0.98)) for value in near))
-    if high > LOG_SCALE_RATIO:
+    if high > RATIO_LOG_SCALE:
         low, high = max(low, 1e-3) / 1.2, 1.2 * high
         _set_log_scale(ax, low, high)
     else:
@@ -198,6 +202,12 @@ def _scale_ratio(ax: Axes, curves: Mapping[str, Curve]) -> list[str]:
         for name, curve in curves.items()
         if ((curve.value < low) | (curve.value > high)).mean() > 0.05
     ]
+
+
+def _is_inside(ax: Axes, curve: Curve) -> bool:
+    """Whether more than a few points of a curve lie in the frame: else its legend says nothing."""
+    low, high = ax.get_ylim()
+    return bool(((curve.value >= low) & (curve.value <= high)).mean() > 0.05)
 
 
 def _set_log_scale(ax: Axes, low: float, high: float) -> None:

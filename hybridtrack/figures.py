@@ -103,7 +103,7 @@ def _draw_reliability(table: Table, looks: Looks, information: RunInformation) -
         columns = ("mean_probability", "frequency", "standard_error", "share_of_steps")
         given, came, error, share = (np.asarray(table[column])[mine] for column in columns)
         look = looks[name]
-        style: dict[str, Any] = {"color": look.colour, "linestyle": look.dashes}
+        style: dict[str, Any] = {"color": look.colour, "linestyle": look.dashes, "clip_on": False}
         ax.errorbar(given, came, 2 * error, marker="o", markersize=3, label=look.label, **style)
         edges = np.asarray(table["from_probability"])[mine]
         width = (edges[1] - edges[0]) / (len(names) + 1)
@@ -111,6 +111,8 @@ def _draw_reliability(table: Table, looks: Looks, information: RunInformation) -
     ax.set(xlim=(0, 1), ylim=(-0.02, 1.02), ylabel="share that was the last")
     below.set(xlabel="probability that the mode now is the last one", ylabel="share of\nsteps")
     below.set_ylim(bottom=0.0)
-    caption = f"Reliability over {information.runs:,} runs; bars: ±2 standard errors"
+    errors = np.isfinite(np.asarray(table["standard_error"], dtype=float)).any()
+    caption = f"Reliability over {information.runs:,} run{'s' * (information.runs != 1)}"
+    caption += "; bars: ±2 standard errors" * bool(errors)
     finish(figure, information.title, caption, [])
     return figure

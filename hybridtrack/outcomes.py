@@ -85,7 +85,7 @@ def _ratio_by_step(first: Moments, second: Moments, difference: Moments) -> dict
     diverged under either.
     """
     n = second.n
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         ratio = np.where((first.n == n) & (difference.n == n), first.mean / second.mean, np.nan)
         spread = (1 - ratio) * first.squares + ratio * (ratio - 1) * second.squares
         spread += ratio * difference.squares
@@ -102,10 +102,10 @@ def _ratio_rows(
     assert leading is not None
     three = [(label, quantity), (leading, quantity), (label, quantity + DIFFERENCE)]
     squares = _ratio_by_step(*(group.steps[key] for key in three))
-    root = np.sqrt(squares["value"])
     kind = quantity.partition("_")[0]
     yield f"{kind}_mse_ratio", squares
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        root = np.sqrt(squares["value"])
         error = squares["standard_error"] / (2 * root)
     yield f"{kind}_rmse_ratio", {"value": root, "standard_error": error}
 

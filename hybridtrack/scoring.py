@@ -102,7 +102,8 @@ class Layout(NamedTuple):
     likelihoods: bool  # these three: see Given
     leads: bool
     paired: bool
-    final: bool  # whether it is there and can be scored
+    told: bool  # whether the probability that the mode now is the last one is there ...
+    final: bool  # ... and can be scored
 
 
 class Sheet(NamedTuple):
@@ -129,6 +130,7 @@ def layout(names: Names, given: Given) -> Layout:
         likelihoods=given.likelihoods,
         leads=given.leads,
         paired=given.paired,
+        told=given.final,
         final=given.final and bool(names.truth_modes),
     )
 

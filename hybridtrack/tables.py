@@ -213,7 +213,7 @@ def as_json(path: Path) -> dict[str, Any]:
     manifest = results.require_complete(path)
     tables = {
         name: [_finite(row) for row in results.read_rows(path, name)]
-        for name in ("summary", "comparisons", "published")
+        for name in ("summary", "comparisons", "reliability", "published")
     }
     return {
         "folder": str(path),

@@ -156,12 +156,13 @@ def tally(totals, sheet, layout, step, runs, scans, held, estimates):
                 subtract(sheet.scratch[0], sheet.rows[VELOCITY_ROW], sheet.leading_velocity[k])
                 add_to_step(sheet.scratch[0], runs, totals, i, step + k)
                 i += 1
-        if layout.final:
+        if layout.told:
             probability = estimates.final_mode_probability[k]
             add_to_step(probability, runs, totals, i, step + k)
             totals.n[i + 1, step + k] = runs
             totals.mean[i + 1, step + k] = estimates.final_mode_prior[k, 0]
-            add_to_bins(totals.final_bins, probability, scans.truth.final[k], held[k, 0])
+            if layout.final:
+                add_to_bins(totals.final_bins, probability, scans.truth.final[k], held[k, 0])
 
 
 class Plan(NamedTuple):
@@ -182,7 +183,7 @@ def plan(names: Names, given: Given) -> Plan:
         series += [
             quantity + DIFFERENCE for quantity in (POSITION, VELOCITY) if quantity in quantities
         ]
-    if kernels.final:
+    if kernels.told:
         series += ["final_mode_probability", "final_mode_prior"]
     return Plan(quantities, (*quantities, *series), kernels)
 

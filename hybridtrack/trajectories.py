@@ -32,7 +32,7 @@ def draw_trajectory(tracks: Table, looks: Looks, information: RunInformation) ->
     errors = not plane and "truth" in paths
     rows, height, heights = (2, 4.2, (1, 1)) if errors else (1, 3.2, (1,))
     figure, (ax, *below) = panels(rows, 1, height, sharey=False, heights=heights)
-    _plot_paths(ax, paths, looks)
+    _plot_paths(ax, paths, looks, crosses_above=plane)
     leaving = _frame_trajectory(figure, ax, paths, plane)
     if errors:
         leaving += [n for n in _plot_errors(below[0], paths, looks) if n not in leaving]
@@ -42,11 +42,11 @@ def draw_trajectory(tracks: Table, looks: Looks, information: RunInformation) ->
     return figure
 
 
-def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks) -> None:
+def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks, *, crosses_above: bool) -> None:
     if "measurement" in paths:
         label, colour, _ = looks["raw"]
         # Crosses wider than the truth, which would hide dots; too many would hide the lines.
-        above = 3 if paths["measurement"].shape[1] <= 500 else 1
+        above = 3 if crosses_above and paths["measurement"].shape[1] <= 500 else 1
         cross: dict[str, Any] = {"markersize": 4, "markeredgewidth": 0.5, "zorder": above}
         ax.plot(*paths["measurement"], "+", color=colour, label=label, **cross)
     if "truth" in paths:

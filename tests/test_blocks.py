@@ -17,7 +17,7 @@ from hybridtrack.blocks import (
     summarise,
 )
 from hybridtrack.config import Window
-from hybridtrack.executors import Stopped
+from hybridtrack.errors import Stopped
 from hybridtrack.experiment import run as run_experiment
 from hybridtrack.outcomes import paired
 from hybridtrack.roots import square_root

@@ -81,9 +81,22 @@ def test_a_bound_is_a_figure_with_a_sign(tmp_path):
             "'mode' belongs to a claim with 'fig",
         ),
         ("estimator: SBF, value: 1", "'metric' is missing in this claim; add it"),
+        (
+            f"compare: [SBF, HBF], {METRIC}, sign: less, tolerance: 1",
+            "'tolerance' has no part in a",
+        ),
+        (
+            f"estimator: SBF, {METRIC}, sign: less, value: 1, tolerance: 1",
+            "'tolerance' has no part",
+        ),
+        (
+            f"compare: [SBF, HBF], {METRIC}, sign: equal, tolerance: 0",
+            "is 0, which no two ever meet",
+        ),
+        ("estimator: SBF, metric: likelihood_distinctness, value: 1", "which SBF doesn't have; it"),
         (f"compare: [SBF, HBF], {METRIC}, sign: equal, value: 2", "'value' of two that are equal"),
         (f"estimator: SBF, {METRIC}", "'value' is missing in this claim on one"),
-        (f"compare: [SBF, HBF], {METRIC}, sign: equal", "'tolerance' is missing: how far from 1"),
+        (f"compare: [SBF, HBF], {METRIC}, sign: equal", "'tolerance' is missing in this compari"),
         (
             "estimator: IMM, metric: final_mode_brier, value: 1",
             "which IMM doesn't have; it has",

@@ -44,7 +44,12 @@ def folder(tmp_path):
     published = [
         ("long " + "Y" * 90, LONG, "m", "all", 1.0, 0.5, None, 2.0, 0.1, "[x]", "x", False, "[/z]")
     ]
-    for name, filled in (("summary", rows), ("published", published), ("comparisons", [])):
+    for name, filled in (
+        ("summary", rows),
+        ("published", published),
+        ("comparisons", []),
+        ("reliability", []),
+    ):
         columns = results.SCHEMAS[name].names
         table = results.pa.table(
             {column: [row[i] for row in filled] for i, column in enumerate(columns)},

@@ -90,8 +90,11 @@ def try_out(
                 f"the matrices of mode '{mode.name}' hold {these}; name a motion instead",
             )
     n_x = len(bank.state_names)
+    ends_s = np.array([shortest, longest] if uneven else [shortest])
     with np.errstate(all="ignore"):
-        ends_s = np.array([shortest, longest] if uneven else [shortest])
+        for mode in bank.modes:
+            if mode.motion is not None:
+                _try_motion(mode, ends_s, bank.dimensions, document, path)
         model = bank.discretise(ends_s, np.zeros(n_x), np.eye(n_x))
     for j, name in enumerate(bank.names):
         parts = (model.state_transition, model.process_noise_covariance, model.input_effect)
@@ -105,6 +108,19 @@ def try_out(
             path, "the rates of the chain are too large to compute with; check their units"
         )
     return model
+
+
+def _try_motion(
+    mode: Mode, steps_s: Array, dimensions: int, document: Document, path: Keys
+) -> None:
+    """A motion model may refuse a step's length."""
+    assert mode.motion is not None
+    try:
+        MOTION_MODELS[mode.motion].discretise(steps_s, dimensions, **mode.parameters)
+    except UserError as error:
+        said = str(error).rstrip(".")
+        place = _whence(document, path, "modes", mode.name, "motion")
+        raise document.error(place, f"mode '{mode.name}': {said}") from None
 
 
 def _whence(document: Document, path: Keys, *keys: str) -> Keys:

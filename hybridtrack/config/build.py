@@ -51,7 +51,8 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         _check_span(name, window, cases, document)
     sensor = truths.sensor(form, truth_modes, cases, initial.two_point, document)
     claims = tuple(
-        built_claim(i, form, chosen, cases, sensor, document) for i in range(len(form.published))
+        built_claim(i, form, chosen, truth_modes, cases, sensor, document)
+        for i in range(len(form.published))
     )
     return Experiment(
         name=form.name,
@@ -212,7 +213,7 @@ def _check_span(name: str, window: WindowForm, cases: tuple[Case, ...], document
 def _resolved(form: Form, claims: tuple[Claim, ...], folder: Path) -> dict[str, Any]:
     data = form.model_dump(by_alias=True, exclude_none=True)
     for written, claim in zip(data["published"], claims, strict=True):
-        if claim.value is not None:
+        if claim.value is not None and (claim.sign is None or claim.compare is not None):
             written["tolerance"] = claim.tolerance
     recording = data["truth"].get("recording", {})
     for holder in (recording, recording.get("reference", {})):

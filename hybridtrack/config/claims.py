@@ -1,5 +1,7 @@
 """Published claims: what they need, and whether the scenario can be held against them."""
 
+from collections.abc import Iterator
+
 from hybridtrack.config import checks
 from hybridtrack.config.description import ChosenEstimator
 from hybridtrack.config.exact import exact_figure
@@ -15,6 +17,7 @@ def built_claim(
     i: int,
     form: ScenarioForm,
     chosen: tuple[ChosenEstimator, ...],
+    truth_modes: tuple[str, ...],
     cases: tuple[Case, ...],
     sensor: Sensor,
     document: Document,
@@ -31,7 +34,7 @@ def built_claim(
         _check_exact(claim, document, path)
         exact = exact_figure(claim, cases, sensor, document, path)
     else:
-        _check_of_runs(claim, form, chosen, document, path)
+        _check_of_runs(claim, form, chosen, truth_modes, document, path)
     if claim.compare is None and claim.value is None:
         raise document.error(path, "'value' is missing in this claim on one figure; add it")
     if claim.compare is None and claim.sign not in (None, *(("less", "greater") * (exact is None))):
@@ -67,6 +70,7 @@ def _check_of_runs(
     claim: ClaimForm,
     form: ScenarioForm,
     chosen: tuple[ChosenEstimator, ...],
+    truth_modes: tuple[str, ...],
     document: Document,
     path: Keys,
 ) -> None:
@@ -84,7 +88,7 @@ def _check_of_runs(
                     f"'{label}' is no estimator here; {checks.nearest(label, labels)}",
                 )
             if label is not None:
-                _check_metric(label, claim.metric, chosen, document, path)
+                _check_metric(label, claim.metric, chosen, truth_modes, document, path)
     if claim.compare is not None and claim.compare[0] == claim.compare[1]:
         raise document.error(
             (*path, "compare"), f"'compare' names {claim.compare[0]} twice; name two estimators"
@@ -94,11 +98,22 @@ def _check_of_runs(
             path, "'sign' is missing in this comparison; add less, greater or equal"
         )
     equal = claim.compare is not None and claim.sign == "equal"
+    judged = claim.compare is not None and claim.value is not None
+    if claim.tolerance is not None and claim.sign in ("less", "greater") and not judged:
+        raise document.error(
+            (*path, "tolerance"), f"'tolerance' has no part in a claim of {claim.sign}; remove it"
+        )
+    if equal and claim.tolerance == 0.0:
+        raise document.error(
+            (*path, "tolerance"), "'tolerance' is 0, which no two ever meet; make it larger"
+        )
     if equal and claim.value is not None:
         raise document.error((*path, "value"), "'value' of two that are equal is 1; remove it")
     if equal and claim.tolerance is None:
         raise document.error(
-            path, "'tolerance' is missing: how far from 1 may the ratio of two that are equal be?"
+            path,
+            "'tolerance' is missing in this comparison; add how far from 1 the ratio of two that "
+            "are equal may be, such as 0.05",
         )
     if claim.window != "all" and claim.window not in form.windows:
         raise document.error(
@@ -109,16 +124,18 @@ def _check_of_runs(
 
 
 def _check_metric(
-    label: str, metric: str, chosen: tuple[ChosenEstimator, ...], document: Document, path: Keys
+    label: str,
+    metric: str,
+    chosen: tuple[ChosenEstimator, ...],
+    truth_modes: tuple[str, ...],
+    document: Document,
+    path: Keys,
 ) -> None:
     """A metric that the estimator has: raw measurements are positions, one mode needs no guess."""
     known: tuple[str, ...] = ("position_",)
     for one in chosen:
         if one.label == label:
-            several = len(one.bank.modes) > 1
-            known = ("position_", "velocity_", *(("mode_", "true_", "likelihood_") * several))
-            if one.estimator.bound(one.settings).is_set:
-                known = (*known, "final_mode_")
+            known = (*known, "velocity_", *_of_modes(one, bool(truth_modes)))
     if not metric.startswith(known):
         there = ", ".join(name for name in METRICS if name.startswith(known))
         raise document.error(
@@ -126,9 +143,24 @@ def _check_metric(
         )
 
 
+def _of_modes(one: ChosenEstimator, truth: bool) -> Iterator[str]:
+    """How the metrics of modes begin that an estimator has.
+
+    Where several supermodes are one mode, there is no likelihood of that.
+    """
+    bounded = one.estimator.bound(one.settings).is_set
+    if len(one.bank.modes) > 1 and not bounded and one.estimator.has_likelihoods:
+        yield "likelihood_"
+    if len(one.bank.modes) > 1 and truth:
+        yield from ("mode_", "true_mode_")
+    if bounded and truth:
+        yield "final_mode_"
+
+
 def _tolerance(claim: ClaimForm, document: Document, path: Keys) -> float:
-    """As given, else half a unit of the last digit that is printed."""
-    if claim.tolerance is not None or claim.value is None:
+    """As given, else half a unit of the last digit that is printed; a bound has none."""
+    bound = claim.estimator is not None and claim.sign is not None
+    if claim.tolerance is not None or claim.value is None or bound:
         return claim.tolerance or 0.0
     try:
         return printed_tolerance(document.source_text((*path, "value")) or "")

@@ -79,6 +79,11 @@ class Estimator(Protocol):
         ...
 
     @property
+    def has_likelihoods(self) -> bool:
+        """Whether it gives one of each mode, where modes are no supermodes."""
+        ...
+
+    @property
     def bound(self) -> Callable[[Any], Bound]:
         """How its chain is bounded, by its settings.
 
@@ -90,8 +95,17 @@ class Estimator(Protocol):
         """What it makes of a bank's model for some steps; kept for all blocks with such steps."""
         ...
 
-    def begin(self, settings: Any, prepared: Any, initial_mean: Array) -> AtWork:
-        """Start on a block: `prepared` for its first span, initial_mean (n_x, lanes)."""
+    def begin(
+        self,
+        settings: Any,
+        prepared: Any,
+        initial_mean: Array,
+        stop: threading.Event | None = None,
+    ) -> AtWork:
+        """Start on a block: `prepared` for its first span, initial_mean (n_x, lanes).
+
+        Whose spans take longer than half a second looks at `stop` on the way, and raises Stopped.
+        """
         ...
 
 
@@ -111,6 +125,11 @@ class BankEstimator(NamedTuple):
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
     bound: Callable[[Any], Bound] = _no_bound  # that `model` puts on the bank's chain
 
+    @property
+    def has_likelihoods(self) -> bool:
+        """Always."""
+        return True
+
     def is_told_modes(self, settings: Any) -> bool:
         """Whether it has to be given the true modes."""
         return self.recursion(settings).interaction == _bank.INHERIT
@@ -120,8 +139,14 @@ class BankEstimator(NamedTuple):
         own = self.model(model, settings)
         return Prepared(own, _layout.kernel_model(own))
 
-    def begin(self, settings: Any, prepared: "Prepared", initial_mean: Array) -> "Running":
-        """The recursion at k = 0."""
+    def begin(
+        self,
+        settings: Any,
+        prepared: "Prepared",
+        initial_mean: Array,
+        stop: threading.Event | None = None,
+    ) -> "Running":
+        """The recursion at k = 0; a span takes milliseconds."""
         return Running(self.recursion(settings), prepared, initial_mean)
 
 

@@ -11,13 +11,14 @@ all of them, so each sequence has a weight for every supermode of its present mo
 costs no sequences.
 """
 
+import threading
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridtrack.chains import Bound
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Stopped, UserError
 from hybridtrack.estimators import NO_KNOWN_MODES, Estimates, memory
 from hybridtrack.estimators._bank import foresee
 from hybridtrack.estimators._layout import (
@@ -32,7 +33,7 @@ from hybridtrack.estimators._tree import Chain, Sequences, Tree, advance
 from hybridtrack.models import JumpMarkovModel
 from hybridtrack.vectors import WIDTH, aligned_zeros
 
-RUNS_PER_CALL = 8  # half a second at most for 75 scans, with 1,000 sequences of nine modes too
+RUNS_PER_CALL, SUPERMODES_PER_CALL = 8, 40_000  # half a second at most, for 75 scans
 
 
 class Settings(NamedTuple):
@@ -55,13 +56,18 @@ class Prepared(NamedTuple):
 class Running:
     """The sequences of a block of runs at work; see AtWork."""
 
-    def __init__(self, most: int, first: Prepared, initial_mean: Array) -> None:
+    def __init__(
+        self, most: int, first: Prepared, initial_mean: Array, stop: threading.Event | None
+    ) -> None:
         """Begin with one sequence, of no mode yet, whose supermodes are as probable as at k = 0."""
         model, chain = first.model, first.chain
         n_modes, _, n_x = model.measurement_matrix.shape
         n_packed, n_supermodes = n_x * (n_x + 1) // 2, chain.mode.size
         n_groups, runs = -(-most // WIDTH), initial_mean.shape[1]
-        self._most, self._model = most, model
+        self._most, self._model, self._stop = most, model, stop
+        self._runs_per_call = min(
+            RUNS_PER_CALL, max(1, SUPERMODES_PER_CALL // (most * n_supermodes))
+        )
         self._prior = chain.initial_probabilities.copy()
         self._sequences = Sequences(
             mean=aligned_zeros(runs, n_groups, n_x, WIDTH),
@@ -98,8 +104,10 @@ class Running:
         work, chain = memory.workspace(self._model), prepared.chain
         shared = (self._sequences, self._tree, work, prepared.kernel, chain, self._most)
         with np.errstate(all="ignore"):  # uncompiled, NumPy would warn of what is dealt with
-            for first in range(0, n_runs, RUNS_PER_CALL):
-                runs = (first, min(first + RUNS_PER_CALL, n_runs))
+            for first in range(0, n_runs, self._runs_per_call):
+                if self._stop is not None and self._stop.is_set():
+                    raise Stopped
+                runs = (first, min(first + self._runs_per_call, n_runs))
                 advance(*shared, measurements, room, runs)
         if len(room.final_mode_prior):
             foresee(self._prior, np.empty_like(self._prior), chain, room.final_mode_prior)
@@ -119,6 +127,8 @@ class BestSequences:
         "leak": (0.0, 1.0),
         "most_transitions": (0.0, 100.0),
     }
+
+    has_likelihoods = False
 
     def is_told_modes(self, settings: Settings) -> bool:
         """Never."""
@@ -157,9 +167,15 @@ class BestSequences:
             model = model._replace(final_probability=found.final_probability[0])
         return Prepared(kernel, chain, model)
 
-    def begin(self, settings: Settings, prepared: Prepared, initial_mean: Array) -> Running:
+    def begin(
+        self,
+        settings: Settings,
+        prepared: Prepared,
+        initial_mean: Array,
+        stop: threading.Event | None = None,
+    ) -> Running:
         """At k = 0."""
-        return Running(settings.sequences, prepared, initial_mean)
+        return Running(settings.sequences, prepared, initial_mean, stop)
 
 
 def _in_logarithms(matrices: Array) -> SparseMaps:
