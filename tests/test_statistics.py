@@ -460,6 +460,33 @@ def test_reliability_has_the_bootstraps_errors():
     assert found.calibration_error.standard_error == pytest.approx(errors[-1], rel=0.12)
 
 
+def test_the_calibration_error_has_the_jackknifes_error():
+    """Of runs of very different lengths, whose number of steps errs along with the gaps.
+
+    Two estimates of one error differ by terms of 1/n: 2 % of 400 runs, and a margin.
+    """
+    rng = np.random.default_rng(35)
+    runs = 400
+    sums, p, came = foretold(rng, runs, slope=0.1)
+    for run in range(runs):  # a run of a low level is short, and one of a high level is long
+        steps = 3 if p[run].mean() < 0.5 else 30
+        place = (p[run, :steps] * 4).astype(int)
+        for i in range(4):
+            here = place == i
+            parts = (here.sum(), p[run, :steps][here].sum(), came[run, :steps][here].sum())
+            sums.reshape(3, 4, runs)[:, i, run] = parts
+    everyone = np.ones(runs, dtype=bool)
+    found = reliability([vector_moments(sums, everyone)]).calibration_error
+
+    def without(run):
+        left = np.delete(sums, run, axis=1)
+        return reliability([vector_moments(left, everyone[1:])]).calibration_error.value
+
+    values = np.array([without(run) for run in range(runs)])
+    jackknife = np.sqrt((runs - 1) / runs * ((values - values.mean()) ** 2).sum())
+    assert found.standard_error == pytest.approx(jackknife, rel=0.04)
+
+
 def test_reliability_of_several_cases_and_of_nothing():
     rng = np.random.default_rng(33)
     halves = [foretold(rng, 100, slope=s)[0] for s in (0.2, 0.7)]
