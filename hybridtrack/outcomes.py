@@ -90,7 +90,6 @@ def _ratio_by_step(first: Moments, second: Moments, difference: Moments) -> dict
         spread = (1 - ratio) * first.squares + ratio * (ratio - 1) * second.squares
         spread += ratio * difference.squares
         error = np.sqrt(np.maximum(spread, 0.0) / (n * (n - 1))) / second.mean
-    error[n < 2] = np.nan
     return {"value": ratio, "standard_error": error}
 
 
