@@ -116,6 +116,11 @@ def exact_row_kernel(function: Callable[..., Any]) -> Any:
     return numba.njit(function, cache=True, forceinline=True, fastmath=EXACT, **UNCOUNTED)
 
 
+def host_processor() -> str:
+    """The kind of processor that kernels are compiled for: its instructions decide on last bits."""
+    return str(llvmlite.binding.get_host_cpu_name())
+
+
 def kernels_are_cached() -> bool:
     """Whether this version's kernels were compiled before (the first use takes a while)."""
     return any(Path(numba.config.CACHE_DIR).rglob("_bank.advance-*.nbi"))

@@ -22,7 +22,7 @@ from hybridtrack.blocks import (
     run_block,
     summarise,
 )
-from hybridtrack.compiled import PACKAGE, source_digest
+from hybridtrack.compiled import PACKAGE, host_processor, source_digest
 from hybridtrack.config import Experiment, dump
 from hybridtrack.executors import in_order
 from hybridtrack.results import RunFolder
@@ -256,7 +256,11 @@ def _manifest(experiment: Experiment) -> dict[str, Any]:
             **{name: metadata.version(name) for name in packages},
         },
         "git": _git(),
-        "host": {"system": platform.platform(), "machine": platform.machine()},
+        "host": {
+            "system": platform.platform(),
+            "machine": platform.machine(),
+            "processor": host_processor(),
+        },
         "command": sys.argv[1:],
         "started": _now(),
     }

@@ -85,7 +85,8 @@ def _reason(error: OSError) -> str:
     return (error.strerror or str(error)).lower()
 
 
-def _make(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Raises UserError where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -99,7 +100,7 @@ class RunFolder:
         """Makes the folder. Raises UserError where it holds anything else than this run."""
         self.path = path
         self.digest = digest
-        _make(path)
+        make_folder(path)
         manifest = read_manifest(path)
         if manifest is None and _holds_something(path):
             raise UserError(f"{path}: this folder holds something else; name another with --out")
@@ -142,7 +143,7 @@ class RunFolder:
 
         The runs go into an Arrow file with LZ4, a tenth of the work that Parquet is.
         """
-        _make(self._shards)
+        make_folder(self._shards)
         options = pa.ipc.IpcWriteOptions(compression="lz4")
         with (
             replacing(self._shards / f"{name}.arrow") as temporary,
@@ -168,7 +169,7 @@ class RunFolder:
         Memory holds one at a time. The file says which shards it holds, so that it can be gone on
         from whenever this process is killed.
         """
-        _make(self.unfinished)
+        make_folder(self.unfinished)
         with (
             replacing(self.unfinished / "runs.parquet") as temporary,
             contextlib.ExitStack() as stack,
@@ -180,7 +181,7 @@ class RunFolder:
                     table = _arrow_table(source)
                 else:
                     source = self.path / "runs.parquet"
-                    (table,) = _row_groups(source, [self._assembled.index(name)])
+                    (table,) = row_groups(source, [self._assembled.index(name)])
                 if writer is None:
                     writer = stack.enter_context(columns.writer(temporary, table.schema))
                     writer.add_key_value_metadata({"shards": json.dumps(names)})
@@ -210,7 +211,7 @@ class RunFolder:
     def write_table(self, name: str, rows: Mapping[str, Any]) -> None:
         """One of SCHEMAS from columns (empty ones too), for `publish`."""
         table = columns.table(name, rows)
-        _make(self.unfinished)
+        make_folder(self.unfinished)
         with (
             replacing(self.unfinished / f"{name}.parquet") as temporary,
             columns.writer(temporary, table.schema) as writer,
@@ -299,7 +300,7 @@ def _arrow_table(path: Path) -> pa.Table:
         raise _damaged(path, error) from None
 
 
-def _row_groups(path: Path, groups: Iterable[int] | None = None) -> Iterator[pa.Table]:
+def row_groups(path: Path, groups: Iterable[int] | None = None) -> Iterator[pa.Table]:
     """Row groups of a runs.parquet, all or some. Raises UserError where it is damaged."""
     try:
         with pq.ParquetFile(path, read_dictionary=["case", "estimator", "window"]) as file:
@@ -432,4 +433,4 @@ def read_runs(path: Path) -> Iterator[pa.Table]:
 
     A shard's rows go by estimator, window and run; there is each combination of the three.
     """
-    yield from _row_groups(path / "runs.parquet")
+    yield from row_groups(path / "runs.parquet")

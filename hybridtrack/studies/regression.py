@@ -1,0 +1,332 @@
+"""Is a run worse than its baseline? A test for every figure, the errors of all of them bounded.
+
+A *figure* is a metric of an estimator in a window. Where both runs have one seed the test is
+paired: it looks at the differences run by run, and what the two have in common cancels. It is
+Student's, at a level that all figures share (Bonferroni): the chance that any of them cries wolf is
+at most the family error. A change smaller than rounding makes on another machine is none.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from hybridtrack import columns
+from hybridtrack.errors import UserError
+from hybridtrack.models import Array
+from hybridtrack.statistics import (
+    METRICS,
+    POSITION,
+    POSITION_AT_SCANS,
+    QUANTITIES,
+    Metric,
+    RunSums,
+    SumMoments,
+    VectorMoments,
+    compare,
+    merge_sum_moments,
+    merge_vectors,
+    pair_moments,
+    ratio_of_sums,
+    sum_moments,
+)
+
+FAMILY_ERROR = 1e-6  # that any figure cries wolf; that a detectable change is missed
+ROUNDING = 1e-9  # relative: the same sources on another processor, and a margin of 1,000
+
+SAME, UNCHANGED, WORSE, BETTER, UNTOLD = "same", "unchanged", "worse", "better", "untold"
+
+# Squared errors are told by their roots alone: both would be one test done twice.
+TESTED: Mapping[str, Metric] = {n: m for n, m in METRICS.items() if not n.endswith(("_m2", "_s2"))}
+DIVERGED = "diverged_runs"
+
+
+class Change(NamedTuple):
+    """One figure, now and in the baseline."""
+
+    metric: str
+    estimator: str
+    window: str
+    baseline: float
+    now: float
+    low: float  # of the change, now - baseline: its interval at the shared level
+    high: float
+    detectable: float  # the smallest change that would have been found, with the family's error
+    verdict: str
+
+    @property
+    def change(self) -> float:
+        """Now - baseline."""
+        return self.now - self.baseline
+
+
+class Comparison(NamedTuple):
+    """Every figure of a run held against its baseline."""
+
+    changes: list[Change]
+    paired: bool
+    runs: int  # compared: pairs, or those of the run
+    identical: bool  # to the last bit
+
+
+class _Shard(NamedTuple):
+    """Some runs of one case: sums and numbers (n_quantities, n_estimators, n_windows, n_runs)."""
+
+    place: tuple[int, int]  # case, first run
+    estimators: list[str]
+    windows: list[str]
+    sums: Array
+    numbers: Array
+    sound: NDArray[np.bool_]  # (n_estimators, n_runs)
+
+    def first(self, runs: int) -> "_Shard":
+        return self._replace(
+            sums=self.sums[..., :runs],
+            numbers=self.numbers[..., :runs],
+            sound=self.sound[..., :runs],
+        )
+
+
+def _shard(table: pa.Table) -> _Shard:
+    """A row group of runs.parquet, or of a baseline, which leaves out what no step has."""
+    estimators, windows = (columns.names_in(table[name]) for name in ("estimator", "window"))
+    shape = (len(estimators), len(windows), -1)
+    rows = columns.as_numpy(table["run"]).reshape(shape)
+
+    def values(quantity: str, kind: str) -> Array:
+        name = f"{quantity}_{kind}"
+        if name not in table.column_names:
+            return np.full(rows.shape, np.nan if kind == "sum" else 0.0)
+        return columns.as_numpy(table[name]).reshape(shape).astype(np.float64)
+
+    sums, numbers = (np.stack([values(q, kind) for q in QUANTITIES]) for kind in ("sum", "count"))
+    sound = columns.as_numpy(table["status"]).reshape(shape)[:, 0] == 0
+    place = tuple(int(columns.as_numpy(table[name])[0]) for name in ("case_number", "run"))
+    return _Shard((place[0], place[1]), estimators, windows, sums, numbers, sound)
+
+
+def hold_against(
+    new: Iterable[pa.Table],
+    old: Iterable[pa.Table],
+    *,
+    paired: bool,
+    family_error: float = FAMILY_ERROR,
+    rounding: float = ROUNDING,
+) -> Comparison:
+    """Compare the shards of a run with those of its baseline; paired: both have one seed.
+
+    Raises UserError where their estimators or windows differ, or no run is in both.
+    """
+    gathered = _paired(new, old) if paired else _unpaired(new, old)
+    figures = list(gathered.figures())
+    level = family_error / max(1, len(figures))
+    changes = [_judge(figure, level, family_error, rounding) for figure in figures]
+    return Comparison(changes, paired, gathered.runs, gathered.identical)
+
+
+class _Figure(NamedTuple):
+    """A figure before it is judged: value now and then, the change's error and its freedom."""
+
+    metric: str
+    estimator: str
+    window: str
+    now: float
+    baseline: float
+    error: float
+    freedom: int
+    discordant: tuple[int, int] | None = None  # of diverged runs: now alone, then alone
+
+
+class _Gathered:
+    """Moments of all shards, by case."""
+
+    def __init__(self, paired: bool) -> None:
+        self.estimators: list[str] = []
+        self.windows: list[str] = []
+        self.runs = 0
+        self.identical = paired
+        self.pairs: dict[int, VectorMoments] = {}  # leading axes: quantity, estimator, window
+        self.single: tuple[dict[int, SumMoments], dict[int, SumMoments]] = ({}, {})
+        self.diverged: dict[str, list[int]] = {}  # now and then: both, now alone, then alone
+
+    def check(self, shard: _Shard) -> None:
+        if not self.estimators:
+            self.estimators, self.windows = shard.estimators, shard.windows
+        for kind, names, wanted in (
+            ("estimators", shard.estimators, self.estimators),
+            ("windows", shard.windows, self.windows),
+        ):
+            if names != wanted:
+                raise UserError(
+                    f"the {kind} are {', '.join(wanted)} here and {', '.join(names)} in the "
+                    "baseline; renew it"
+                )
+
+    def figures(self) -> Iterator[_Figure]:
+        for e, estimator in enumerate(self.estimators):
+            for w, window in enumerate(self.windows):
+                for name, metric in TESTED.items():
+                    found = self._figure(name, metric, estimator, window, e, w)
+                    if found is not None:
+                        yield found
+            now, alone, then = self.diverged[estimator]
+            counts = (float(now), float(now - alone + then))
+            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, (alone, then))
+
+    def _figure(
+        self, name: str, metric: Metric, estimator: str, window: str, e: int, w: int
+    ) -> _Figure | None:
+        quantity = metric.quantity
+        if estimator == "raw" and quantity == POSITION:
+            quantity = POSITION_AT_SCANS
+        cell = (QUANTITIES.index(quantity), e, w)
+        if self.pairs:
+            cases = [VectorMoments(*(of[cell] for of in case)) for case in self.pairs.values()]
+            pair = compare(cases, metric.root)
+            n = pair.difference.n_runs
+            if not n:
+                return None
+            error = pair.difference.standard_error
+            return _Figure(name, estimator, window, pair.first, pair.second, error, n - len(cases))
+        now, then = (
+            ratio_of_sums([tuple(float(of[cell]) for of in c) for c in cases.values()], metric.root)
+            for cases in self.single
+        )
+        if not now.n_runs and not then.n_runs:
+            return None
+        error = math.hypot(now.standard_error, then.standard_error)
+        freedom = min(now.n_runs, then.n_runs) - len(self.single[0])
+        return _Figure(name, estimator, window, now.value, then.value, error, freedom)
+
+    def note_diverged(self, shard: _Shard, other: _Shard | None, side: int) -> None:
+        for e, estimator in enumerate(shard.estimators):
+            counts = self.diverged.setdefault(estimator, [0, 0, 0])
+            if other is not None:
+                counts[0] += int((~shard.sound[e]).sum())
+                counts[1] += int((~shard.sound[e] & other.sound[e]).sum())
+                counts[2] += int((shard.sound[e] & ~other.sound[e]).sum())
+            elif side == 0:
+                number = int((~shard.sound[e]).sum())
+                counts[0] += number
+                counts[1] += number
+            else:
+                counts[2] += int((~shard.sound[e]).sum())
+
+
+def _pairs(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> Iterator[tuple[_Shard, _Shard]]:
+    """Shards of the same runs; both come in the order of cases and runs, cut alike."""
+    ours, theirs = map(_shard, new), map(_shard, old)
+    one, other = next(ours, None), next(theirs, None)
+    while one is not None and other is not None:
+        if one.place == other.place:
+            runs = min(one.sums.shape[-1], other.sums.shape[-1])  # a last one may be shorter
+            yield one.first(runs), other.first(runs)
+        behind, ahead = one.place <= other.place, other.place <= one.place
+        one = next(ours, None) if behind else one
+        other = next(theirs, None) if ahead else other
+
+
+def _paired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
+    gathered = _Gathered(paired=True)
+    for ours, theirs in _pairs(new, old):
+        gathered.check(ours)
+        gathered.check(theirs)
+        gathered.runs += ours.sums.shape[-1]
+        for a, b in ((ours.sums, theirs.sums), (ours.numbers, theirs.numbers)):
+            gathered.identical &= np.array_equal(a, b, equal_nan=True)
+        moments = pair_moments(_run_sums(ours), _run_sums(theirs))
+        known, case = gathered.pairs.get(ours.place[0]), ours.place[0]
+        gathered.pairs[case] = moments if known is None else merge_vectors(known, moments)
+        gathered.note_diverged(ours, theirs, 0)
+    if not gathered.runs:
+        raise UserError("the run and its baseline have no run in common; renew the baseline")
+    return gathered
+
+
+def _run_sums(shard: _Shard) -> RunSums:
+    sound = np.broadcast_to(shard.sound[:, np.newaxis], shard.sums.shape[1:])
+    return RunSums(shard.sums, shard.numbers, sound)
+
+
+def _unpaired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
+    gathered = _Gathered(paired=False)
+    for side, tables in enumerate((new, old)):
+        for shard in map(_shard, tables):
+            gathered.check(shard)
+            sums, numbers, sound = _run_sums(shard)
+            moments = sum_moments(sums, numbers, np.broadcast_to(sound, sums.shape))
+            cases, case = gathered.single[side], shard.place[0]
+            known = cases.get(case)
+            cases[case] = moments if known is None else merge_sum_moments(known, moments)
+            gathered.note_diverged(shard, None, side)
+            gathered.runs += sums.shape[-1] if side == 0 else 0
+    return gathered
+
+
+# ---- judgement -------------------------------------------------------------------------------
+
+
+def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Change:
+    """level: of this figure's two-sided test; missed: the chance that what is detectable is not."""
+    if figure.discordant is not None:
+        return _judge_diverged(figure, level)
+    of = (figure.metric, figure.estimator, figure.window, figure.baseline, figure.now)
+    change = figure.now - figure.baseline
+    slack = rounding * abs(figure.baseline)
+    if math.isnan(figure.now) != math.isnan(figure.baseline):
+        verdict = WORSE if math.isnan(figure.now) else BETTER
+        return Change(*of, math.nan, math.nan, math.nan, verdict)
+    if figure.freedom < 1 or math.isnan(figure.error):
+        verdict = SAME if change == 0.0 else UNCHANGED if abs(change) <= slack else UNTOLD
+        return Change(*of, math.nan, math.nan, math.nan, verdict)
+    half = _student(figure.freedom, level / 2) * figure.error
+    detectable = half + _student(figure.freedom, missed) * figure.error + slack
+    low, high = change - half, change + half
+    verdict = SAME if change == 0.0 and figure.error == 0.0 else UNCHANGED
+    if low > slack or high < -slack:
+        less = METRICS[figure.metric].better == "less"
+        verdict = WORSE if (change > 0) == less else BETTER
+    return Change(*of, low, high, detectable, verdict)
+
+
+def _judge_diverged(figure: _Figure, level: float) -> Change:
+    """Runs that diverged now or then alone are as many by chance: an exact test of signs."""
+    from scipy.stats import binom
+
+    assert figure.discordant is not None
+    now, then = figure.discordant
+    many, both = max(now, then), now + then
+    chance = float(binom.sf(many - 1, both, 0.5)) if both else 1.0
+    verdict = SAME if not both else UNCHANGED
+    if 2 * chance < level:
+        verdict = WORSE if now > then else BETTER
+    smallest = float(math.ceil(math.log2(2 / level)))  # so many, all on one side
+    of = (figure.metric, figure.estimator, figure.window, figure.baseline, figure.now)
+    return Change(*of, math.nan, math.nan, smallest, verdict)
+
+
+def _student(freedom: int, tail: float) -> float:
+    """Student's quantile with this probability beyond it."""
+    from scipy.special import stdtrit
+
+    return float(-stdtrit(freedom, tail))
+
+
+def runs_to_detect(
+    comparison: Comparison, wanted: float, family_error: float = FAMILY_ERROR
+) -> int:
+    """How many runs find a relative change of the whole window's figures, from what these found.
+
+    Errors fall with the root of the number of runs. Figures near 0 have no relative change.
+    """
+    ratios = [
+        change.detectable / (wanted * abs(change.baseline))
+        for change in comparison.changes
+        if change.window == "all" and change.baseline and math.isfinite(change.detectable)
+    ]
+    if not ratios:
+        raise UserError("no figure here has a standard error; give the number of runs instead")
+    return math.ceil(comparison.runs * max(ratios) ** 2)
