@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 # The recorded flight lies inside this package; what it would install besides is not needed.
 FLIGHT = traffic==2.13
 
-.PHONY: run test ordeals check bench ledger clean
+.PHONY: run test ordeals check bench ledger baselines clean
 
 run: $(VENV)/.installed
 	$(BIN)/hybridtrack run configs/rmimm_fig5.yaml
@@ -27,6 +27,15 @@ bench: $(VENV)/.installed
 
 ledger: $(VENV)/.installed
 	$(BIN)/python tests/readme.py
+
+# What tests/test_baselines.py holds every shipped scenario against; say in CHANGELOG.md why.
+baselines: $(VENV)/.installed
+	for file in configs/*.yaml; do \
+		name=$$(basename $$file .yaml); \
+		runs=128; [ $$name = recorded_flight ] && runs=20; \
+		$(BIN)/hybridtrack baseline $$name --runs $$runs --quiet \
+			-o tests/baselines/$$name.parquet || exit; \
+	done
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

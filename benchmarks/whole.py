@@ -198,8 +198,9 @@ class Cost(NamedTuple):
 INSIDE = """
 import sys
 from pathlib import Path
-from hybridtrack.cli import _spare_time, main
-_spare_time()
+from hybridtrack.cli import main
+from hybridtrack.console import spare_time
+spare_time()
 sys.path.append(sys.argv.pop(1))
 import whole
 noted = Path(sys.argv.pop(1))

@@ -1,151 +1,23 @@
 """The command line: parse, call, print. Everything heavy is imported where it is used."""
 
-import contextlib
-import functools
-import gc
-import io
-import os
-import signal
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybridtrack import __version__
+from hybridtrack.console import Interrupted, app, command, interrupted, run_app, say, work_in
 from hybridtrack.errors import UserError
 
 if TYPE_CHECKING:
     from hybridtrack.config import Experiment
 
-app = typer.Typer(
-    name="hybridtrack",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
-    epilog="Examples:\n\n  hybridtrack run rmimm_fig5\n\n  hybridtrack init my_scenario",
-)
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-class Interrupted(BaseException):
-    """Ctrl-C. No KeyboardInterrupt, since typer ends on that without a word."""
+__all__ = ["app", "main"]
 
 
 def main() -> None:
     """Entry point of the console script."""
-    _spare_time()
-    _prepare_streams()
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _on_interrupt)
-    try:
-        try:
-            app()
-        finally:
-            sys.stdout.flush()
-    except Interrupted:
-        _interrupted()
-    except OSError as error:
-        _cannot_go_on(error)
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is said; Python closes down
-        _drop_what_stderr_cannot_take()
-        gc.freeze()  # and needn't look through all objects for garbage once more: 0.3 s
-
-
-def _spare_time() -> None:
-    """Before numpy comes: no threads for matrices as small as ours, and few looks for garbage.
-
-    Python's own threshold of 700 objects suits programs that live longer than their imports.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    gc.set_threshold(50_000, 20, 20)
-
-
-def _prepare_streams() -> None:
-    """A closed stream swallows what is written; one without our characters gets `?`."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
-
-
-def _drop_what_stderr_cannot_take() -> None:
-    """A full disk under stderr is no failure; left alone, Python ends with exit code 120 for it."""
-    try:
-        sys.stderr.flush()
-    except OSError:
-        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
-
-
-def _on_interrupt(number: int, frame: object) -> NoReturn:
-    raise Interrupted
-
-
-def say(text: str) -> None:
-    """A line for the person, not for the pipe."""
-    with contextlib.suppress(OSError):  # nobody listens: no reason to stop
-        print(text, file=sys.stderr, flush=True)
-
-
-def _interrupted(hint: str = "") -> NoReturn:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # heard: once more would only cut this short
-    say(f"interrupted{hint}")
-    sys.exit(130)
-
-
-def _cannot_go_on(error: OSError) -> NoReturn:
-    """A reader that went away (| head) ends us in silence; a full disk is told."""
-    with contextlib.suppress(OSError, ValueError):  # else Python tries stdout once more at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if isinstance(error, BrokenPipeError):
-        sys.exit(141)
-    where = error.filename or "the output"
-    reason = (error.strerror or str(error)).lower()
-    say(f"error: {where}: cannot be read or written ({reason}); make room, or check its rights")
-    sys.exit(2)
-
-
-def command(*examples: str, name: str | None = None) -> Callable[[Function], Function]:
-    """A command: its mistakes are one sentence on stderr, its help ends in examples."""
-
-    def register(function: Function) -> Function:
-        @functools.wraps(function)
-        def guarded(*arguments: Any, **options: Any) -> Any:
-            try:
-                return function(*arguments, **options)
-            except UserError as error:
-                say(f"error: {error}")
-                raise typer.Exit(2) from None
-            except OSError as error:  # typer would take a broken pipe for itself
-                _cannot_go_on(error)
-
-        epilog = "Examples:\n\n" + "\n\n".join(f"  {example}" for example in examples)
-        app.command(name=name, epilog=epilog)(guarded)
-        return function
-
-    return register
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        print(f"hybridtrack {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    """State estimation in stochastic hybrid systems: one YAML scenario in, tables and figures
-    out. Results go to stdout, progress and errors to stderr; bad input exits with 2."""
+    run_app()
 
 
 @command(
@@ -178,22 +50,12 @@ def run(
     """
     from hybridtrack import experiment as experiments
     from hybridtrack import pictures, results
-    from hybridtrack.executors import available_cores
-    from hybridtrack.progress import progress
 
     experiment = _load(config, set_ or (), runs, seed)
     folder = out if out is not None else experiments.default_folder(experiment)
     if force:
         results.clear(folder, experiments.digest(experiment))
-    if not experiments.is_complete(folder, experiment):
-        if not quiet:
-            _say_if_compiling()
-        try:
-            with progress(quiet) as report:
-                experiments.run(experiment, folder, workers or available_cores(), report)
-        except Interrupted:
-            _interrupted(_what_is_kept(folder))
-    elif not quiet:
+    if not _finish(experiment, folder, workers, quiet) and not quiet:
         _say_complete(folder, experiment.runs)
     if not pictures.are_drawn(folder):
         if not quiet:
@@ -201,8 +63,27 @@ def run(
         try:
             pictures.draw_run(folder)
         except Interrupted:
-            _interrupted(f"; {folder} is complete but for figures: the same command draws them")
+            interrupted(f"; {folder} is complete but for figures: the same command draws them")
     print_run(folder, json)
+
+
+def _finish(experiment: "Experiment", folder: Path, workers: int | None, quiet: bool) -> bool:
+    """Run what isn't finished in its folder yet; False where there was nothing to do."""
+    from hybridtrack import experiment as experiments
+    from hybridtrack.executors import available_cores
+    from hybridtrack.progress import progress
+
+    work_in(folder)
+    if experiments.is_complete(folder, experiment):
+        return False
+    if not quiet:
+        _say_if_compiling()
+    try:
+        with progress(quiet) as report:
+            experiments.run(experiment, folder, workers or available_cores(), report)
+    except Interrupted:
+        interrupted(_what_is_kept(folder))
+    return True
 
 
 def _load(config: str, settings: Sequence[str], runs: int | None, seed: int | None) -> "Experiment":
@@ -394,3 +275,136 @@ def ledger(
     from hybridtrack.studies.ledger import markdown
 
     print(markdown(run_dir), end="")
+
+
+@command(
+    "hybridtrack baseline softbound_ex1 -o tests/baselines/softbound_ex1.parquet --runs 1000",
+    "hybridtrack baseline my_scenario.yaml -o my_scenario.parquet --detect 1%",
+)
+def baseline(
+    config: Annotated[
+        str,
+        typer.Argument(metavar="CONFIG|RUN_DIR", help="A scenario, or a run's folder."),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The baseline's file.")],
+    runs: Annotated[
+        int | None, typer.Option(help="Monte Carlo runs instead of the file's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed instead of the file's.")] = None,
+    detect: Annotated[
+        str | None,
+        typer.Option(metavar="CHANGE", help="As many runs as find a change like 1% unpaired."),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Threads.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value; may be repeated."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
+) -> None:
+    """Write what `hybridtrack check` compares later runs with, to be committed.
+
+    It holds the summary and, so that runs of one seed can be paired, every run's sums.
+    """
+    from hybridtrack.studies import baselines
+
+    folder = _run_of(config, set_ or (), runs, seed, detect, workers, quiet)
+    baselines.write(folder, output)
+    print(output)
+
+
+@command(
+    "hybridtrack check softbound_ex1 --against tests/baselines/softbound_ex1.parquet",
+    "hybridtrack check runs/softbound_ex1-0123456789 --against softbound_ex1.parquet --junit r.xml",
+)
+def check(
+    config: Annotated[
+        str,
+        typer.Argument(metavar="CONFIG|RUN_DIR", help="A scenario, or a run's folder."),
+    ],
+    against: Annotated[Path, typer.Option(metavar="BASELINE", help="What `baseline` wrote.")],
+    runs: Annotated[
+        int | None, typer.Option(help="Monte Carlo runs; the baseline's by default.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Random seed; the baseline's by default, to be paired.")
+    ] = None,
+    detect: Annotated[
+        str | None,
+        typer.Option(metavar="CHANGE", help="As many runs as find a change like 1% unpaired."),
+    ] = None,
+    family_error: Annotated[
+        float, typer.Option(help="Chance that any figure cries wolf, or a detectable change isn't.")
+    ] = 1e-6,
+    workers: Annotated[int | None, typer.Option(min=1, help="Threads.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value; may be repeated."),
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Print every window's figures.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")] = False,
+    junit: Annotated[Path | None, typer.Option(help="Write JUnit XML to this file.")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="Write a Markdown table to it.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
+) -> None:
+    """Compare a run with a baseline; exit with 1 if any figure is worse.
+
+    With the baseline's seed runs are compared pair by pair; the same sources on the same kind of
+    machine have to give the same bytes. Otherwise every figure is tested, with the chance that any
+    of them cries wolf bounded.
+    """
+    from hybridtrack.results import write_text
+    from hybridtrack.studies import baselines, reports
+
+    if not 0.0 < family_error < 1.0:
+        raise UserError(f"--family-error {family_error:g}: a chance lies between 0 and 1")
+    wanted = baselines.read(against)
+    if not Path(config).is_dir():
+        runs = wanted.runs if runs is None and detect is None else runs
+        seed = wanted.seed if seed is None else seed
+    folder = _run_of(config, set_ or (), runs, seed, detect, workers, quiet)
+    report = reports.held_against(folder, wanted, family_error)
+    for file, text in ((junit, reports.as_junit), (markdown, reports.as_markdown)):
+        if file is not None:
+            write_text(file, text(report))
+    print(reports.as_json(report) if json else reports.as_text(report, everything=all_), end="")
+    if report.failed:
+        raise typer.Exit(1)
+
+
+def _run_of(
+    config: str,
+    settings: Sequence[str],
+    runs: int | None,
+    seed: int | None,
+    detect: str | None,
+    workers: int | None,
+    quiet: bool,
+) -> Path:
+    """The folder of a finished run: the one named, or the scenario's, which is run if need be."""
+    from hybridtrack import experiment as experiments
+    from hybridtrack.results import require_complete
+
+    if Path(config).is_dir():
+        if runs is not None or seed is not None or detect is not None or settings:
+            raise UserError(
+                f"{config}: this run is finished; --runs, --seed, --detect and --set are for a "
+                "scenario"
+            )
+        require_complete(Path(config))
+        return Path(config)
+    if runs is not None and detect is not None:
+        raise UserError("--runs and --detect both say how many runs; give one of them")
+    experiment = _load(config, settings, runs, seed)
+    if detect is not None:
+        from hybridtrack.studies import reports
+
+        pilot = experiment._replace(runs=min(experiment.runs, reports.PILOT_RUNS))
+        folder = experiments.default_folder(pilot)
+        _finish(pilot, folder, workers, quiet)
+        number = reports.runs_wanted(folder, detect)
+        say(f"{number:,} runs find a change of {detect}, unpaired")
+        experiment = _load(config, settings, number, seed)
+    folder = experiments.default_folder(experiment)
+    _finish(experiment, folder, workers, quiet)
+    return folder
