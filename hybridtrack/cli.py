@@ -347,9 +347,9 @@ def check(
     markdown: Annotated[Path | None, typer.Option(help="Write a Markdown table to it.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
 ) -> None:
-    """Compare a run with a baseline; exit with 1 if any figure is worse.
+    """Compare a run with a baseline.
 
-    With the baseline's seed runs are compared pair by pair; the same sources on the same kind of
+    Exits with 1 if any figure is worse. With the baseline's seed runs are compared pair by pair; the same sources on the same kind of
     machine have to give the same bytes. Otherwise every figure is tested, with the chance that any
     of them cries wolf bounded.
     """

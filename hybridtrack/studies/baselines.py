@@ -45,6 +45,11 @@ def describe(folder: Path) -> Baseline:
     scenario = load(folder / results.CONFIG).resolved
     monte_carlo = {k: v for k, v in scenario["monte_carlo"].items() if k not in ("runs", "seed")}
     kept = {k: v for k, v in scenario.items() if k not in TOLD} | {"monte_carlo": monte_carlo}
+    kept = json.loads(json.dumps(kept))
+    recording = kept["truth"].get("recording", {})
+    for holder in (recording, recording.get("reference", {})):
+        if "package" not in holder:
+            holder.pop("file", None)  # lies elsewhere on another machine
     versions = manifest["versions"]
     made = {name: str(versions[name]) for name in sorted(versions) if name != "pandas"}
     made |= {
@@ -54,7 +59,7 @@ def describe(folder: Path) -> Baseline:
     return Baseline(
         folder / "runs.parquet",
         manifest["name"],
-        json.loads(json.dumps(kept)),
+        kept,
         manifest["seed"],
         manifest["runs"],
         made,

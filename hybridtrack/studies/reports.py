@@ -83,7 +83,7 @@ def _difference(one: Any, other: Any, key: str = "") -> tuple[str, str, str] | N
         for name in [*one, *(name for name in other if name not in one)]:
             path = f"{key}.{name}" if key else name
             if name not in one or name not in other:
-                here, there = ("there" if name in of else "missing" for of in (one, other))
+                here, there = ("present" if name in of else "missing" for of in (one, other))
                 return path, here, there
             found = _difference(one[name], other[name], path)
             if found is not None:
