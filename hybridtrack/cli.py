@@ -302,9 +302,10 @@ def baseline(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
 ) -> None:
-    """Write what `hybridtrack check` compares later runs with, to be committed.
+    """Write a baseline, which `check` compares with.
 
-    It holds the summary and, so that runs of one seed can be paired, every run's sums.
+    It is a file to be committed: the summary and, so that runs of one seed can be paired, every
+    run's sums.
     """
     from hybridtrack.studies import baselines
 
@@ -349,9 +350,9 @@ def check(
 ) -> None:
     """Compare a run with a baseline.
 
-    Exits with 1 if any figure is worse. With the baseline's seed runs are compared pair by pair; the same sources on the same kind of
-    machine have to give the same bytes. Otherwise every figure is tested, with the chance that any
-    of them cries wolf bounded.
+    Exits with 1 if any figure is worse. With the baseline's seed runs are compared pair by pair,
+    and the same sources on the same kind of machine have to give the same bytes. Otherwise every
+    figure is tested, with the chance that any of them cries wolf bounded.
     """
     from hybridtrack.results import write_text
     from hybridtrack.studies import baselines, reports
