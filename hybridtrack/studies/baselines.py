@@ -28,6 +28,7 @@ class Baseline(NamedTuple):
 
     path: Path
     name: str
+    digest: str  # of the run folder: scenario and sources
     scenario: dict[str, Any]  # as resolved, without what only tells of it
     seed: int
     runs: int
@@ -59,6 +60,7 @@ def describe(folder: Path) -> Baseline:
     return Baseline(
         folder / "runs.parquet",
         manifest["name"],
+        manifest["digest"],
         kept,
         manifest["seed"],
         manifest["runs"],
@@ -73,6 +75,7 @@ def write(folder: Path, file: Path) -> None:
     facts = {
         "form": FORM,
         "name": told.name,
+        "digest": told.digest,
         "scenario": told.scenario,
         "seed": told.seed,
         "runs": told.runs,
@@ -115,7 +118,7 @@ def read(file: Path) -> Baseline:
             )
         if not metadata.num_rows:
             raise UserError(f"{file}: this baseline holds no run; renew it")
-        names = ("name", "scenario", "seed", "runs", "made", "summary")
+        names = ("name", "digest", "scenario", "seed", "runs", "made", "summary")
         return Baseline(file, *(facts[name] for name in names))
     except FileNotFoundError:
         raise UserError(
