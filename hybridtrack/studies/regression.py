@@ -138,6 +138,7 @@ class _Figure(NamedTuple):
     error: float
     freedom: int
     discordant: tuple[int, int] | None = None  # of diverged runs: now alone, then alone
+    share: float = 0.5  # of all runs, those that are now's: of discordant ones too, by chance
 
 
 class _Gathered:
@@ -147,6 +148,7 @@ class _Gathered:
         self.estimators: list[str] = []
         self.windows: list[str] = []
         self.runs = 0
+        self.runs_then = 0
         self.identical = paired
         self.pairs: dict[int, VectorMoments] = {}  # leading axes: quantity, estimator, window
         self.single: tuple[dict[int, SumMoments], dict[int, SumMoments]] = ({}, {})
@@ -174,7 +176,8 @@ class _Gathered:
                         yield found
             now, alone, then = self.diverged[estimator]
             counts = (float(now), float(now - alone + then))
-            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, (alone, then))
+            share = self.runs / (self.runs + self.runs_then)
+            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, (alone, then), share)
 
     def _figure(
         self, name: str, metric: Metric, estimator: str, window: str, e: int, w: int
@@ -235,6 +238,7 @@ def _paired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
         gathered.check(ours)
         gathered.check(theirs)
         gathered.runs += ours.sums.shape[-1]
+        gathered.runs_then += theirs.sums.shape[-1]
         for a, b in ((ours.sums, theirs.sums), (ours.numbers, theirs.numbers)):
             gathered.identical &= np.array_equal(a, b, equal_nan=True)
         moments = pair_moments(_run_sums(ours), _run_sums(theirs))
@@ -263,6 +267,7 @@ def _unpaired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
             cases[case] = moments if known is None else merge_sum_moments(known, moments)
             gathered.note_diverged(shard, None, side)
             gathered.runs += sums.shape[-1] if side == 0 else 0
+            gathered.runs_then += sums.shape[-1] if side == 1 else 0
     return gathered
 
 
@@ -293,17 +298,21 @@ def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Cha
 
 
 def _judge_diverged(figure: _Figure, level: float) -> Change:
-    """Runs that diverged now or then alone are as many by chance: an exact test of signs."""
+    """Of runs that diverged now or then alone each has its share by chance: an exact test.
+
+    Of pairs it is the test of signs. Without pairs it errs on the safe side: of a given number of
+    diverged runs those of now scatter less than a binomial, since runs are drawn but once.
+    """
     from scipy.stats import binom
 
     assert figure.discordant is not None
     now, then = figure.discordant
-    many, both = max(now, then), now + then
-    chance = float(binom.sf(many - 1, both, 0.5)) if both else 1.0
+    both, share = now + then, figure.share
+    many, few = float(binom.sf(now - 1, both, share)), float(binom.cdf(now, both, share))
     verdict = SAME if not both else UNCHANGED
-    if 2 * chance < level:
-        verdict = WORSE if now > then else BETTER
-    smallest = float(math.ceil(math.log2(2 / level)))  # so many, all on one side
+    if both and 2 * min(many, few) < level:
+        verdict = WORSE if many < few else BETTER
+    smallest = float(math.ceil(math.log(level / 2) / math.log(share)))  # so many, all of them now
     of = (figure.metric, figure.estimator, figure.window, figure.baseline, figure.now)
     return Change(*of, math.nan, math.nan, smallest, verdict)
 
