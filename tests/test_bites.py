@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -202,9 +201,7 @@ UNIFORM_START = in_model(
 P0_IS_A_STD = in_model(initial_covariance=lambda m: m.initial_covariance**0.5)
 Q_OF_ANOTHER_MODE = in_model(process_noise_covariance=lambda m: m.process_noise_covariance[:, ::-1])
 CHAIN_TWICE = in_model(transition_matrix=lambda m: m.transition_matrix @ m.transition_matrix)
-R_2_PERCENT = in_model(
-    measurement_noise_covariance=lambda m: 1.02 * m.measurement_noise_covariance
-)
+R_2_PERCENT = in_model(measurement_noise_covariance=lambda m: 1.02 * m.measurement_noise_covariance)
 Q_10_PERCENT = in_model(process_noise_covariance=lambda m: 1.1 * m.process_noise_covariance)
 
 DEFECTS = (
