@@ -293,53 +293,57 @@ EDITS = (
 
 @pytest.fixture(scope="module")
 def edited(tmp_path_factory):
-    """Run folders by edit, of copies of the package that run side by side.
+    """Run folders by edit and scenario, of copies of the package that run side by side.
 
     Each compiles its kernels, some 12 s of a core, into a cache of its own.
     """
-    processes, folders = [], {}
-    for edit in EDITS:
-        home = tmp_path_factory.mktemp("copy")
-        copied = shutil.copytree(
-            PACKAGE, home / "hybridtrack", ignore=shutil.ignore_patterns("__pycache__")
-        )
-        text = (copied / edit.file).read_text(encoding="utf-8")
-        assert text.count(edit.line) == 1, edit.name
-        text = text.replace(edit.line, edit.planted)
-        (copied / edit.file).write_text(text, encoding="utf-8")
-        folders[edit.name] = home / "run"
-        options = ("--runs", str(RUNS), "--seed", str(SEED), "--quiet", "--out", str(home / "run"))
-        hidden = ("NUMBA_CACHE_DIR",)  # set by our own import, and read by every child
-        environment = {key: value for key, value in os.environ.items() if key not in hidden}
-        environment |= {"PYTHONPATH": str(home), "XDG_CACHE_HOME": str(home / "cache")}
-        processes.append(
-            subprocess.Popen(
-                [sys.executable, "-m", "hybridtrack", "run", str(find(THREE).resolve()), *options],
-                cwd=home,
-                env=environment,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-        )
-    try:
-        for process in processes:
-            _, said = process.communicate(timeout=300)
-            assert process.returncode == 0, said
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-    return folders
+    homes = {edit.name: planted_copy(edit, tmp_path_factory.mktemp("copy")) for edit in EDITS}
+    for name in SCENARIOS:
+        processes = [run_in(home, name) for home in homes.values()]
+        try:
+            for process in processes:
+                _, said = process.communicate(timeout=300)
+                assert process.returncode == 0, said
+        finally:
+            for process in processes:
+                process.kill()
+                process.wait()
+    return {(edit, name): home / name for edit, home in homes.items() for name in SCENARIOS}
 
 
+def planted_copy(edit, home):
+    """The package with an edit, in a folder that goes into PYTHONPATH."""
+    leave_out = shutil.ignore_patterns("__pycache__")
+    file = shutil.copytree(PACKAGE, home / "hybridtrack", ignore=leave_out) / edit.file
+    text = file.read_text(encoding="utf-8")
+    assert text.count(edit.line) == 1, edit.name
+    file.write_text(text.replace(edit.line, edit.planted), encoding="utf-8")
+    return home
+
+
+def run_in(home, name):
+    """A run of a scenario by the package in this folder, just begun."""
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment |= {"PYTHONPATH": str(home), "XDG_CACHE_HOME": str(home / "cache")}
+    options = ("--runs", str(RUNS), "--seed", str(SEED), "--quiet", "--out", name)
+    return subprocess.Popen(
+        [sys.executable, "-m", "hybridtrack", "run", str(find(name).resolve()), *options],
+        cwd=home,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
 @pytest.mark.parametrize("edit", EDITS, ids=lambda edit: edit.name)
-def test_a_defect_of_a_kernel_is_found(edit, edited, baseline):
-    folder = edited[edit.name]
+def test_a_defect_of_a_kernel_is_found(edit, name, edited, baseline):
+    folder = edited[edit.name, name]
     sources = results.require_complete(folder)["versions"]["sources"]
-    assert sources != baseline[THREE, SEED].made["sources"]  # the copy has run, not this package
+    assert sources != baseline[name, SEED].made["sources"]  # the copy has run, not this package
     for seed in (SEED, OTHER_SEED):
-        assert found_worse(folder, baseline, THREE, seed)
+        assert found_worse(folder, baseline, name, seed)
 
 
 # ---- no defect -------------------------------------------------------------------------------
