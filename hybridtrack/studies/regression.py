@@ -138,6 +138,7 @@ class _Figure(NamedTuple):
     error: float
     freedom: int
     discordant: tuple[int, int] | None = None  # of diverged runs: now alone, then alone
+    share: float = 0.5  # of all runs, those that are now's: of discordant ones too, by chance
 
 
 class _Gathered:
@@ -147,6 +148,7 @@ class _Gathered:
         self.estimators: list[str] = []
         self.windows: list[str] = []
         self.runs = 0
+        self.runs_then = 0
         self.identical = paired
         self.pairs: dict[int, VectorMoments] = {}  # leading axes: quantity, estimator, window
         self.single: tuple[dict[int, SumMoments], dict[int, SumMoments]] = ({}, {})
@@ -174,7 +176,8 @@ class _Gathered:
                         yield found
             now, alone, then = self.diverged[estimator]
             counts = (float(now), float(now - alone + then))
-            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, (alone, then))
+            share = self.runs / (self.runs + self.runs_then)
+            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, (alone, then), share)
 
     def _figure(
         self, name: str, metric: Metric, estimator: str, window: str, e: int, w: int
@@ -187,10 +190,10 @@ class _Gathered:
             cases = [VectorMoments(*(of[cell] for of in case)) for case in self.pairs.values()]
             pair = compare(cases, metric.root)
             n = pair.difference.n_runs
-            if not n:
-                return None
-            error = pair.difference.standard_error
-            return _Figure(name, estimator, window, pair.first, pair.second, error, n - len(cases))
+            if math.isfinite(pair.first) and math.isfinite(pair.second):
+                values, error = (pair.first, pair.second), pair.difference.standard_error
+                return _Figure(name, estimator, window, *values, error, n - len(cases))
+        # Without pairs, or where none is left since one of the two has no such figure.
         now, then = (
             ratio_of_sums([tuple(float(of[cell]) for of in c) for c in cases.values()], metric.root)
             for cases in self.single
@@ -200,6 +203,18 @@ class _Gathered:
         error = math.hypot(now.standard_error, then.standard_error)
         freedom = min(now.n_runs, then.n_runs) - len(self.single[0])
         return _Figure(name, estimator, window, now.value, then.value, error, freedom)
+
+    def add(self, shard: _Shard, side: int) -> None:
+        """A shard's runs by themselves; side: 0 now, 1 then."""
+        sums, numbers, sound = _run_sums(shard)
+        moments = sum_moments(sums, numbers, np.broadcast_to(sound, sums.shape))
+        cases, case = self.single[side], shard.place[0]
+        known = cases.get(case)
+        cases[case] = moments if known is None else merge_sum_moments(known, moments)
+        if side == 0:
+            self.runs += sums.shape[-1]
+        else:
+            self.runs_then += sums.shape[-1]
 
     def note_diverged(self, shard: _Shard, other: _Shard | None, side: int) -> None:
         for e, estimator in enumerate(shard.estimators):
@@ -234,7 +249,8 @@ def _paired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
     for ours, theirs in _pairs(new, old):
         gathered.check(ours)
         gathered.check(theirs)
-        gathered.runs += ours.sums.shape[-1]
+        gathered.add(ours, 0)
+        gathered.add(theirs, 1)
         for a, b in ((ours.sums, theirs.sums), (ours.numbers, theirs.numbers)):
             gathered.identical &= np.array_equal(a, b, equal_nan=True)
         moments = pair_moments(_run_sums(ours), _run_sums(theirs))
@@ -256,13 +272,10 @@ def _unpaired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
     for side, tables in enumerate((new, old)):
         for shard in map(_shard, tables):
             gathered.check(shard)
-            sums, numbers, sound = _run_sums(shard)
-            moments = sum_moments(sums, numbers, np.broadcast_to(sound, sums.shape))
-            cases, case = gathered.single[side], shard.place[0]
-            known = cases.get(case)
-            cases[case] = moments if known is None else merge_sum_moments(known, moments)
+            gathered.add(shard, side)
             gathered.note_diverged(shard, None, side)
-            gathered.runs += sums.shape[-1] if side == 0 else 0
+    if not gathered.runs or not gathered.runs_then:
+        raise UserError("the run or its baseline holds no run; renew the baseline")
     return gathered
 
 
@@ -293,17 +306,21 @@ def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Cha
 
 
 def _judge_diverged(figure: _Figure, level: float) -> Change:
-    """Runs that diverged now or then alone are as many by chance: an exact test of signs."""
+    """Of runs that diverged now or then alone each has its share by chance: an exact test.
+
+    Of pairs it is the test of signs. Without pairs it errs on the safe side: of a given number of
+    diverged runs those of now scatter less than a binomial, since runs are drawn but once.
+    """
     from scipy.stats import binom
 
     assert figure.discordant is not None
     now, then = figure.discordant
-    many, both = max(now, then), now + then
-    chance = float(binom.sf(many - 1, both, 0.5)) if both else 1.0
+    both, share = now + then, figure.share
+    many, few = float(binom.sf(now - 1, both, share)), float(binom.cdf(now, both, share))
     verdict = SAME if not both else UNCHANGED
-    if 2 * chance < level:
-        verdict = WORSE if now > then else BETTER
-    smallest = float(math.ceil(math.log2(2 / level)))  # so many, all on one side
+    if both and 2 * min(many, few) < level:
+        verdict = WORSE if many < few else BETTER
+    smallest = float(math.ceil(math.log(level / 2) / math.log(share)))  # so many, all of them now
     of = (figure.metric, figure.estimator, figure.window, figure.baseline, figure.now)
     return Change(*of, math.nan, math.nan, smallest, verdict)
 
@@ -315,9 +332,7 @@ def _student(freedom: int, tail: float) -> float:
     return float(-stdtrit(freedom, tail))
 
 
-def runs_to_detect(
-    comparison: Comparison, wanted: float, family_error: float = FAMILY_ERROR
-) -> int:
+def runs_to_detect(comparison: Comparison, wanted: float) -> int:
     """How many runs find a relative change of the whole window's figures, from what these found.
 
     Errors fall with the root of the number of runs. Figures near 0 have no relative change.
