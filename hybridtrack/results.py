@@ -30,6 +30,7 @@ RUNNING, COMPLETE = "running", "complete"
 CONFIG, CSV = "config.yaml", "summary.csv"
 LOCK, PART = ".lock", ".part"
 SHARDS, UNFINISHED, FIGURES = "shards", "unfinished", "figures"
+REPEAT = "repeat the run with --force"
 SHARD_NAME = re.compile(r"(?P<place>\d{4,}-\d{6,})-(?P<runs>\d+)")  # place: case and first block
 PART_NAME = re.compile(r"\..+\.\d+\.part(ial)?")
 FIGURE_NAME = re.compile(
@@ -271,9 +272,9 @@ def _remove(folder: Path, is_ours: Callable[[str], object]) -> None:
         raise UserError(f"{folder}: cannot be cleared ({_reason(error)})") from None
 
 
-def _damaged(path: Path, error: Exception) -> UserError:
+def _damaged(path: Path, error: Exception, remedy: str = REPEAT) -> UserError:
     said = " ".join(str(error).split()).rstrip(".")
-    return UserError(f"{path}: this file is damaged ({said}); repeat the run with --force")
+    return UserError(f"{path}: this file is damaged ({said}); {remedy}")
 
 
 def _missing(path: Path) -> UserError:
@@ -300,7 +301,9 @@ def _arrow_table(path: Path) -> pa.Table:
         raise _damaged(path, error) from None
 
 
-def row_groups(path: Path, groups: Iterable[int] | None = None) -> Iterator[pa.Table]:
+def row_groups(
+    path: Path, groups: Iterable[int] | None = None, remedy: str = REPEAT
+) -> Iterator[pa.Table]:
     """Row groups of a runs.parquet, all or some. Raises UserError where it is damaged."""
     try:
         with pq.ParquetFile(path, read_dictionary=["case", "estimator", "window"]) as file:
@@ -309,7 +312,7 @@ def row_groups(path: Path, groups: Iterable[int] | None = None) -> Iterator[pa.T
     except FileNotFoundError:
         raise _missing(path) from None
     except DAMAGE as error:
-        raise _damaged(path, error) from None
+        raise _damaged(path, error, remedy) from None
 
 
 def _locked(path: Path) -> IO[str]:

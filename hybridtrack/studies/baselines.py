@@ -37,7 +37,7 @@ class Baseline(NamedTuple):
 
     def shards(self) -> Iterator[pa.Table]:
         """The rows, shard by shard. Raises UserError where they are damaged."""
-        yield from results.row_groups(self.path)
+        yield from results.row_groups(self.path, remedy="renew it with `hybridtrack baseline`")
 
 
 def describe(folder: Path) -> Baseline:
