@@ -17,6 +17,7 @@ from hybridtrack.config import load
 from hybridtrack.errors import UserError
 from hybridtrack.statistics import QUANTITIES
 
+RENEW = "renew it with `hybridtrack baseline`"
 KEY = b"hybridtrack_baseline"
 FORM = 1  # of the file, for later readers
 # Of the resolved scenario: how it is told, and what the check itself may choose.
@@ -34,10 +35,11 @@ class Baseline(NamedTuple):
     runs: int
     made: dict[str, str]  # versions and machine: where they are the same, so are the bytes
     summary: list[dict[str, Any]]
+    remedy: str = RENEW  # should its rows be damaged
 
     def shards(self) -> Iterator[pa.Table]:
         """The rows, shard by shard. Raises UserError where they are damaged."""
-        yield from results.row_groups(self.path, remedy="renew it with `hybridtrack baseline`")
+        yield from results.row_groups(self.path, None, self.remedy)
 
 
 def describe(folder: Path) -> Baseline:
@@ -66,6 +68,7 @@ def describe(folder: Path) -> Baseline:
         manifest["runs"],
         made,
         results.read_rows(folder, "summary"),
+        results.REPEAT,
     )
 
 
