@@ -310,6 +310,8 @@ def baseline(
     from hybridtrack.studies import baselines
 
     folder = _run_of(config, set_ or (), runs, seed, detect, workers, quiet)
+    if output.resolve().parent == folder.resolve():
+        raise UserError(f"{output}: this lies in the run's own folder; name a file elsewhere")
     baselines.write(folder, output)
     print(output)
 
@@ -354,20 +356,27 @@ def check(
     and the same sources on the same kind of machine have to give the same bytes. Otherwise every
     figure is tested, with the chance that any of them cries wolf bounded.
     """
-    from hybridtrack.results import write_text
     from hybridtrack.studies import baselines, reports
 
-    if not 0.0 < family_error < 1.0:
-        raise UserError(f"--family-error {family_error:g}: a chance lies between 0 and 1")
+    if not 1e-12 <= family_error <= 0.5:
+        raise UserError(f"--family-error {family_error:g}: give a chance from 1e-12 to 0.5")
+    for file in (junit, markdown):
+        if file is not None and file.resolve() == against.resolve():
+            raise UserError(f"{file}: this is the baseline itself; name another file")
     wanted = baselines.read(against)
-    if not Path(config).is_dir():
+    if not _is_run(config):
+        if detect is not None and seed in (None, wanted.seed):
+            raise UserError(
+                f"--detect {detect}: with the baseline's own seed only its {wanted.runs:,} runs "
+                "are compared, pair by pair; give another with --seed"
+            )
         runs = wanted.runs if runs is None and detect is None else runs
         seed = wanted.seed if seed is None else seed
     folder = _run_of(config, set_ or (), runs, seed, detect, workers, quiet)
     report = reports.held_against(folder, wanted, family_error)
     for file, text in ((junit, reports.as_junit), (markdown, reports.as_markdown)):
         if file is not None:
-            write_text(file, text(report))
+            _put(file, text(report))
     print(reports.as_json(report) if json else reports.as_text(report, everything=all_), end="")
     if report.failed:
         raise typer.Exit(1)
@@ -386,7 +395,7 @@ def _run_of(
     from hybridtrack import experiment as experiments
     from hybridtrack.results import require_complete
 
-    if Path(config).is_dir():
+    if _is_run(config):
         if runs is not None or seed is not None or detect is not None or settings:
             raise UserError(
                 f"{config}: this run is finished; --runs, --seed, --detect and --set are for a "
@@ -403,9 +412,33 @@ def _run_of(
         pilot = experiment._replace(runs=min(experiment.runs, reports.PILOT_RUNS))
         folder = experiments.default_folder(pilot)
         _finish(pilot, folder, workers, quiet)
-        number = reports.runs_wanted(folder, detect)
-        say(f"{number:,} runs find a change of {detect}, unpaired")
+        number, decides = reports.runs_wanted(folder, detect)
+        if not quiet:
+            say(f"{number:,} runs find a change of {detect}, unpaired; {decides} decides")
         experiment = _load(config, settings, number, seed)
     folder = experiments.default_folder(experiment)
+    longer = experiments.is_complete(folder, experiment)
+    if longer and require_complete(folder)["runs"] != experiment.runs:  # not what is asked for
+        folder = folder.with_name(f"{folder.name}-{experiment.runs}")
     _finish(experiment, folder, workers, quiet)
     return folder
+
+
+def _is_run(config: str) -> bool:
+    """Whether a folder is meant, and no shipped scenario whose name it has by chance."""
+    from hybridtrack.config import shipped
+    from hybridtrack.results import read_manifest
+
+    path = Path(config)
+    return path.is_dir() and (config not in shipped() or read_manifest(path) is not None)
+
+
+def _put(file: Path, text: str) -> None:
+    """Write a report: whole or not at all, but into what is no regular file, such as a pipe."""
+    from hybridtrack.results import write_text
+
+    if file.exists() and not file.is_file() and not file.is_dir():
+        with file.open("a", encoding="utf-8") as stream:
+            stream.write(text)
+    else:
+        write_text(file, text)

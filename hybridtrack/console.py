@@ -123,13 +123,16 @@ _at_work: list[Path] = []
 def _tell_bug(error: Exception) -> NoReturn:
     """A fault of ours: what is needed to mend it in a file, one line that asks for it."""
     text = f"hybridtrack {__version__}, {sys.argv[1:]}\n\n{traceback.format_exc()}"
+    where = "what follows"
     for folder in (*reversed(_at_work), Path(), Path(tempfile.gettempdir())):
-        file = folder / TRACEBACK
         with contextlib.suppress(OSError):
-            file.write_text(text, encoding="utf-8")
+            (folder / TRACEBACK).write_text(text, encoding="utf-8")
+            where = str(folder / TRACEBACK)
             break
     kind = type(error).__name__
-    say(f"error: this is a bug of hybridtrack ({kind}); please report it with {file}")
+    say(f"error: this is a bug of hybridtrack ({kind}); please report it with {where}")
+    if where == "what follows":
+        say(text)
     sys.exit(101)
 
 

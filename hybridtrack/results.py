@@ -66,6 +66,8 @@ Content = TypeVar("Content")
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside `path`; moved onto it when all went well, removed otherwise."""
+    if not path.name or path.is_dir():
+        raise UserError(f"{path}: this is no file's name; give one")
     temporary = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
         yield temporary

@@ -61,10 +61,9 @@ def test_a_finished_run_is_checked_as_it_is(cwd):
 
 
 def of_seed_3(cwd):
-    """The run that the baseline is of."""
-    found = [path for path in (cwd / "runs").iterdir() if told(path)["seed"] == 3]
-    (one,) = [path for path in found if told(path)["runs"] == 60]
-    return one
+    """A run of the scenario as the baseline is of."""
+    found = [path for path in sorted((cwd / "runs").iterdir()) if told(path)["seed"] == 3]
+    return next(path for path in found if told(path)["runs"] == 60)
 
 
 def told(folder):
@@ -123,10 +122,16 @@ def test_the_same_sources_must_give_the_same_bytes(cwd, worse):
             ["--set", "estimators.NEW={type: imm}"],
             "'estimators.NEW' is present here and missing",
         ),
-        (["--family-error", "2"], "--family-error 2: a chance lies between 0 and 1"),
-        (["--runs", "50", "--detect", "1%"], "--runs and --detect both say how many runs"),
-        (["--detect", "much"], "--detect much: give a change such as 1% or 0.01"),
-        (["--detect", "0.0001%"], "that takes"),
+        (["--family-error", "2"], "--family-error 2: give a chance from 1e-12 to 0.5"),
+        (["--family-error", "1e-323"], "give a chance from 1e-12 to 0.5"),
+        (["--seed=4", "--runs=50", "--detect=1%"], "--runs and --detect both say how many runs"),
+        (["--seed=4", "--detect", "much"], "--detect much: give a change such as 1% or 0.01"),
+        (["--seed=4", "--detect", "1e-200"], "--detect 1e-200: give a change such as 1% or 0.01"),
+        (["--seed=4", "--detect", "0.0005%"], "runs; look for a larger change"),
+        (["--detect", "1%"], "with the baseline's own seed only its 60 runs are compared"),
+        (["--junit", "."], "this is no file's name"),
+        (["--markdown", "b/small.parquet"], "this is the baseline itself; name another file"),
+        (["--set", "truth.legs.1.turn_rate_deg_s=2"], "'truth.legs[1].turn_rate_rad_s' is 0.03"),
     ],
 )
 def test_what_does_not_fit_is_one_sentence(cwd, options, said):
@@ -140,7 +145,24 @@ def test_what_does_not_fit_is_one_sentence(cwd, options, said):
 def test_wanted_changes_tell_the_number_of_runs(cwd):
     done = hybridtrack(cwd, "baseline", "small.yaml", "-o", "d.parquet", "--detect", "60%")
     assert done.returncode == 0
-    assert "runs find a change of 60%, unpaired" in done.stderr
+    assert "runs find a change of 60%, unpaired; " in done.stderr
+    assert done.stderr.endswith(" decides\n")
+
+
+def test_as_many_runs_are_compared_as_are_asked_for(cwd):
+    """Though a longer run is at hand."""
+    assert hybridtrack(cwd, "run", "small.yaml", "--runs", "80", "-q").returncode == 0
+    done = hybridtrack(cwd, "baseline", "small.yaml", "-o", "fewer.parquet", "--runs", "20", "-q")
+    assert done.returncode == 0, done.stderr
+    found = hybridtrack(cwd, "check", "small.yaml", "--against", "fewer.parquet", "-q").stdout
+    assert "20 runs of seed 3 against a baseline of 20 runs" in found
+
+
+def test_a_baseline_does_not_go_into_a_runs_own_folder(cwd):
+    folder = of_seed_3(cwd)
+    done = hybridtrack(cwd, "baseline", str(folder), "-o", str(folder / "runs.parquet"))
+    assert done.returncode == 2
+    assert "this lies in the run's own folder" in done.stderr
 
 
 def test_a_bug_of_ours_is_101_with_its_traceback_in_the_run_folder(tmp_path):

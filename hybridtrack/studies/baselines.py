@@ -20,7 +20,7 @@ from hybridtrack.statistics import QUANTITIES
 RENEW = "renew it with `hybridtrack baseline`"
 KEY = b"hybridtrack_baseline"
 FORM = 1  # of the file, for later readers
-# Of the resolved scenario: how it is told, and what the check itself may choose.
+# Of the resolved scenario, what only tells of it.
 TOLD = ("title", "source", "assumptions", "published")
 
 
@@ -53,12 +53,10 @@ def describe(folder: Path) -> Baseline:
     for holder in (recording, recording.get("reference", {})):
         if "package" not in holder:
             holder.pop("file", None)  # lies elsewhere on another machine
-    versions = manifest["versions"]
+    versions = manifest.get("versions", {})
     made = {name: str(versions[name]) for name in sorted(versions) if name != "pandas"}
-    made |= {
-        "machine": manifest["host"]["machine"],
-        "processor": str(manifest["host"]["processor"]),
-    }
+    host = manifest.get("host", {})
+    made |= {name: str(host.get(name)) for name in ("system", "machine", "processor")}
     return Baseline(
         folder / "runs.parquet",
         manifest["name"],

@@ -3,12 +3,14 @@
 A *figure* is a metric of an estimator in a window. Where both runs have one seed the test is
 paired: it looks at the differences run by run, and what the two have in common cancels. It is
 Student's, at a level that all figures share (Bonferroni): the chance that any of them cries wolf is
-at most the family error. A change smaller than rounding makes on another machine is none.
+at most the family error, as far as Student's test goes: errors that are nearly always small one way
+and rarely large the other need many runs. A change smaller than rounding makes on another machine
+is none. Where fewer than FEW runs have a figure, or a window is met too rarely, nothing is told.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from hybridtrack import columns
 from hybridtrack.errors import UserError
 from hybridtrack.models import Array
+from hybridtrack.results import DAMAGE
 from hybridtrack.statistics import (
     METRICS,
     POSITION,
@@ -35,13 +38,19 @@ from hybridtrack.statistics import (
 )
 
 FAMILY_ERROR = 1e-6  # that any figure cries wolf; that a detectable change is missed
-ROUNDING = 1e-9  # relative: the same sources on another processor, and a margin of 1,000
+ROUNDING = 1e-9  # relative: other rounding was seen to make 1e-11
+SMALLEST = 1e-12  # of a share or a probability; below, it is rounding's own
+FEW = 8  # runs of which an error can be estimated at all
 
 SAME, UNCHANGED, WORSE, BETTER, UNTOLD = "same", "unchanged", "worse", "better", "untold"
 
 # Squared errors are told by their roots alone: both would be one test done twice.
 TESTED: Mapping[str, Metric] = {n: m for n, m in METRICS.items() if not n.endswith(("_m2", "_s2"))}
 DIVERGED = "diverged_runs"
+
+
+class Mismatch(UserError):
+    """A run and a baseline that don't belong together."""
 
 
 class Change(NamedTuple):
@@ -92,6 +101,13 @@ class _Shard(NamedTuple):
 
 def _shard(table: pa.Table) -> _Shard:
     """A row group of runs.parquet, or of a baseline, which leaves out what no step has."""
+    try:
+        return _read_shard(table)
+    except DAMAGE:
+        raise Mismatch("there are rows as no run writes them; renew it") from None
+
+
+def _read_shard(table: pa.Table) -> _Shard:
     estimators, windows = (columns.names_in(table[name]) for name in ("estimator", "window"))
     shape = (len(estimators), len(windows), -1)
     rows = columns.as_numpy(table["run"]).reshape(shape)
@@ -139,6 +155,7 @@ class _Figure(NamedTuple):
     freedom: int
     discordant: tuple[int, int] | None = None  # of diverged runs: now alone, then alone
     share: float = 0.5  # of all runs, those that are now's: of discordant ones too, by chance
+    certain: bool = True  # whether a figure that is there on one side alone tells anything
 
 
 class _Gathered:
@@ -152,6 +169,8 @@ class _Gathered:
         self.identical = paired
         self.pairs: dict[int, VectorMoments] = {}  # leading axes: quantity, estimator, window
         self.single: tuple[dict[int, SumMoments], dict[int, SumMoments]] = ({}, {})
+        # Runs that have a figure at all, (quantity, estimator, window) by case.
+        self.counted: tuple[dict[int, Any], dict[int, Any]] = ({}, {})
         self.diverged: dict[str, list[int]] = {}  # now and then: both, now alone, then alone
 
     def check(self, shard: _Shard) -> None:
@@ -162,7 +181,7 @@ class _Gathered:
             ("windows", shard.windows, self.windows),
         ):
             if names != wanted:
-                raise UserError(
+                raise Mismatch(
                     f"the {kind} are {', '.join(wanted)} here and {', '.join(names)} in the "
                     "baseline; renew it"
                 )
@@ -177,7 +196,8 @@ class _Gathered:
             now, alone, then = self.diverged[estimator]
             counts = (float(now), float(now - alone + then))
             share = self.runs / (self.runs + self.runs_then)
-            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, (alone, then), share)
+            discordant, paired = (alone, then), bool(self.pairs)
+            yield _Figure(DIVERGED, estimator, "", *counts, math.nan, 0, discordant, share, paired)
 
     def _figure(
         self, name: str, metric: Metric, estimator: str, window: str, e: int, w: int
@@ -188,29 +208,40 @@ class _Gathered:
         cell = (QUANTITIES.index(quantity), e, w)
         if self.pairs:
             cases = [VectorMoments(*(of[cell] for of in case)) for case in self.pairs.values()]
-            pair = compare(cases, metric.root)
+            with np.errstate(all="ignore"):
+                pair = compare(cases, metric.root)
             n = pair.difference.n_runs
             if math.isfinite(pair.first) and math.isfinite(pair.second):
-                values, error = (pair.first, pair.second), pair.difference.standard_error
+                values = (pair.first, pair.second)
+                error = pair.difference.standard_error if n >= FEW else math.nan
                 return _Figure(name, estimator, window, *values, error, n - len(cases))
         # Without pairs, or where none is left since one of the two has no such figure.
-        now, then = (
-            ratio_of_sums([tuple(float(of[cell]) for of in c) for c in cases.values()], metric.root)
-            for cases in self.single
-        )
-        if not now.n_runs and not then.n_runs:
+        with np.errstate(all="ignore"):  # of infinite sums
+            now, then = (
+                ratio_of_sums([tuple(float(of[cell]) for of in c) for c in s.values()], metric.root)
+                for s in self.single
+            )
+        there = [float(sum(of[cell] for of in counted.values())) for counted in self.counted]
+        if not any(there):
             return None
-        error = math.hypot(now.standard_error, then.standard_error)
-        freedom = min(now.n_runs, then.n_runs) - len(self.single[0])
-        return _Figure(name, estimator, window, now.value, then.value, error, freedom)
+        fewest = int(min(there))
+        error = math.hypot(now.standard_error, then.standard_error) if fewest >= FEW else math.nan
+        usual = any(n > 0.5 * of for n, of in zip(there, (self.runs, self.runs_then), strict=True))
+        certain = bool(self.pairs) or fewest > 0 or self.diverged[estimator][0] > 0 or usual
+        freedom = fewest - len(self.single[0])
+        values = (now.value, then.value)
+        return _Figure(name, estimator, window, *values, error, freedom, certain=certain)
 
     def add(self, shard: _Shard, side: int) -> None:
         """A shard's runs by themselves; side: 0 now, 1 then."""
         sums, numbers, sound = _run_sums(shard)
-        moments = sum_moments(sums, numbers, np.broadcast_to(sound, sums.shape))
+        with np.errstate(invalid="ignore"):
+            moments = sum_moments(sums, numbers, np.broadcast_to(sound, sums.shape))
         cases, case = self.single[side], shard.place[0]
         known = cases.get(case)
         cases[case] = moments if known is None else merge_sum_moments(known, moments)
+        counted = ((numbers > 0) & sound).sum(axis=-1)
+        self.counted[side][case] = self.counted[side].get(case, 0) + counted
         if side == 0:
             self.runs += sums.shape[-1]
         else:
@@ -253,12 +284,13 @@ def _paired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
         gathered.add(theirs, 1)
         for a, b in ((ours.sums, theirs.sums), (ours.numbers, theirs.numbers)):
             gathered.identical &= np.array_equal(a, b, equal_nan=True)
-        moments = pair_moments(_run_sums(ours), _run_sums(theirs))
+        with np.errstate(all="ignore"):
+            moments = pair_moments(_run_sums(ours), _run_sums(theirs))
         known, case = gathered.pairs.get(ours.place[0]), ours.place[0]
         gathered.pairs[case] = moments if known is None else merge_vectors(known, moments)
         gathered.note_diverged(ours, theirs, 0)
     if not gathered.runs:
-        raise UserError("the run and its baseline have no run in common; renew the baseline")
+        raise Mismatch("the run and its baseline have no run in common; renew it")
     return gathered
 
 
@@ -275,7 +307,9 @@ def _unpaired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
             gathered.add(shard, side)
             gathered.note_diverged(shard, None, side)
     if not gathered.runs or not gathered.runs_then:
-        raise UserError("the run or its baseline holds no run; renew the baseline")
+        raise Mismatch("the run or its baseline holds no run; renew it")
+    if set(gathered.single[0]) != set(gathered.single[1]):
+        raise Mismatch("the run and its baseline have other cases; renew it")
     return gathered
 
 
@@ -288,9 +322,11 @@ def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Cha
         return _judge_diverged(figure, level)
     of = (figure.metric, figure.estimator, figure.window, figure.baseline, figure.now)
     change = figure.now - figure.baseline
-    slack = rounding * abs(figure.baseline)
-    if math.isnan(figure.now) != math.isnan(figure.baseline):
-        verdict = WORSE if math.isnan(figure.now) else BETTER
+    slack = rounding * abs(figure.baseline) + SMALLEST
+    finite = math.isfinite(figure.now), math.isfinite(figure.baseline)
+    if not all(finite):
+        told = figure.certain and any(finite)
+        verdict = (BETTER if finite[0] else WORSE) if told else UNTOLD
         return Change(*of, math.nan, math.nan, math.nan, verdict)
     if figure.freedom < 1 or math.isnan(figure.error):
         verdict = SAME if change == 0.0 else UNCHANGED if abs(change) <= slack else UNTOLD
@@ -308,8 +344,9 @@ def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Cha
 def _judge_diverged(figure: _Figure, level: float) -> Change:
     """Of runs that diverged now or then alone each has its share by chance: an exact test.
 
-    Of pairs it is the test of signs. Without pairs it errs on the safe side: of a given number of
-    diverged runs those of now scatter less than a binomial, since runs are drawn but once.
+    Of pairs it is the test of signs, but where none diverged then, any now is worse. Without pairs
+    it errs on the safe side: of a given number of diverged runs those of now scatter less than a
+    binomial, since runs are drawn but once.
     """
     from scipy.stats import binom
 
@@ -320,6 +357,8 @@ def _judge_diverged(figure: _Figure, level: float) -> Change:
     verdict = SAME if not both else UNCHANGED
     if both and 2 * min(many, few) < level:
         verdict = WORSE if many < few else BETTER
+    if figure.certain and now and not figure.baseline:  # pairs: the scans from which none fled
+        verdict = WORSE
     smallest = float(math.ceil(math.log(level / 2) / math.log(share)))  # so many, all of them now
     of = (figure.metric, figure.estimator, figure.window, figure.baseline, figure.now)
     return Change(*of, math.nan, math.nan, smallest, verdict)
@@ -332,16 +371,19 @@ def _student(freedom: int, tail: float) -> float:
     return float(-stdtrit(freedom, tail))
 
 
-def runs_to_detect(comparison: Comparison, wanted: float) -> int:
+def runs_to_detect(comparison: Comparison, wanted: float) -> tuple[int, Change]:
     """How many runs find a relative change of the whole window's figures, from what these found.
+
+    Of the figure that takes most, which is named.
 
     Errors fall with the root of the number of runs. Figures near 0 have no relative change.
     """
     ratios = [
-        change.detectable / (wanted * abs(change.baseline))
+        (change.detectable / (wanted * abs(change.baseline)), change)
         for change in comparison.changes
         if change.window == "all" and change.baseline and math.isfinite(change.detectable)
     ]
     if not ratios:
         raise UserError("no figure here has a standard error; give the number of runs instead")
-    return math.ceil(comparison.runs * max(ratios) ** 2)
+    ratio, decides = max(ratios, key=lambda found: found[0])
+    return math.ceil(comparison.runs * ratio**2), decides

@@ -18,12 +18,14 @@ from hybridtrack.studies.regression import (
     WORSE,
     Change,
     Comparison,
+    Mismatch,
     hold_against,
     runs_to_detect,
 )
 
 PILOT_RUNS = 1000  # tell how far figures scatter
 MOST_RUNS = 100_000_000
+SMALLEST_CHANGE = 1e-6
 
 
 class Report(NamedTuple):
@@ -60,7 +62,7 @@ def held_against(folder: Path, baseline: Baseline, family_error: float = FAMILY_
         comparison = hold_against(
             run.shards(), baseline.shards(), paired=paired, family_error=family_error
         )
-    except UserError as error:
+    except Mismatch as error:
         raise UserError(f"{baseline.path}: {error}") from None
     return Report(
         run.name, run, baseline, comparison, paired and run.made == baseline.made, family_error
@@ -89,6 +91,10 @@ def _difference(one: Any, other: Any, key: str = "") -> tuple[str, str, str] | N
             if found is not None:
                 return found
         return None
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        pairs = enumerate(zip(one, other, strict=True))
+        found_in = (_difference(a, b, f"{key}[{i}]") for i, (a, b) in pairs)
+        return next((found for found in found_in if found is not None), None)
     same = one == other
     return None if same else (key, _short(one), _short(other))
 
@@ -98,23 +104,27 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:39]}…"
 
 
-def runs_wanted(folder: Path, detect: str) -> int:
+def runs_wanted(folder: Path, detect: str) -> tuple[int, str]:
     """How many runs find a relative change, from a finished run's scatter.
 
-    Against a baseline of as many runs of another seed. Raises UserError where that says nothing.
+    Against a baseline of as many runs of another seed; the figure that decides is named. Raises
+    UserError where that says nothing.
     """
     try:
         wanted = float(detect.removesuffix("%")) / (100 if detect.endswith("%") else 1)
     except ValueError:
         wanted = math.nan
-    if not 0.0 < wanted < 1.0:
+    if not SMALLEST_CHANGE <= wanted < 1.0:
         raise UserError(f"--detect {detect}: give a change such as 1% or 0.01")
     run = baselines.describe(folder)
     alone = hold_against(run.shards(), run.shards(), paired=False)
-    number = runs_to_detect(alone, wanted)
+    number, decides = runs_to_detect(alone, wanted)
+    figure = f"{decides.metric} of {decides.estimator}"
     if number > MOST_RUNS:
-        raise UserError(f"--detect {detect}: that takes {number:,} runs; look for a larger change")
-    return number
+        raise UserError(
+            f"--detect {detect}: {figure} takes {number:,} runs; look for a larger change"
+        )
+    return number, figure
 
 
 # ---- in words --------------------------------------------------------------------------------
