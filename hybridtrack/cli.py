@@ -353,7 +353,7 @@ def check(
     """Compare a run with a baseline.
 
     Exits with 1 if any figure is worse. With the baseline's seed runs are compared pair by pair,
-    and the same sources on the same kind of machine have to give the same bytes. Otherwise every
+    and the same sources on the same kind of machine have to give the same figures. Otherwise every
     figure is tested, with the chance that any of them cries wolf bounded.
     """
     from hybridtrack.studies import baselines, reports

@@ -29,6 +29,7 @@ from hybridtrack.studies.regression import (
     _Figure,
     _judge,
     hold_against,
+    is_beyond_rounding,
     runs_to_detect,
 )
 from models import RANDOM, SMALL, scenario
@@ -718,3 +719,21 @@ def test_rows_that_are_damaged_are_told_when_they_are_read(file):
     with pytest.raises(UserError, match=r"small\.parquet: this file is damaged \(.*\); ") as caught:
         list(held.shards())
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("now", "then", "beyond"),
+    [
+        (1.0 + 1e-10, 1.0, False),
+        (1.0 + 1e-8, 1.0, True),
+        (1e-13, 0.0, False),
+        (1e-11, 0.0, True),
+        (math.nan, math.nan, False),
+        (math.nan, 1.0, True),
+        (math.inf, 1.0, True),
+    ],
+)
+def test_last_bits_are_told_from_changes(now, then, beyond):
+    nothing = (math.nan,) * 3
+    change = Change("position_rmse_m", "KF", "all", then, now, *nothing, UNCHANGED)
+    assert is_beyond_rounding(change) == beyond

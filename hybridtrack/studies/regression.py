@@ -341,6 +341,13 @@ def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Cha
     return Change(*of, low, high, detectable, verdict)
 
 
+def is_beyond_rounding(change: Change, rounding: float = ROUNDING) -> bool:
+    """Whether a figure moved by more than its last bits."""
+    if math.isnan(change.now) and math.isnan(change.baseline):
+        return False
+    return not abs(change.change) <= rounding * abs(change.baseline) + SMALLEST
+
+
 def _judge_diverged(figure: _Figure, level: float) -> Change:
     """Of runs that diverged now or then alone each has its share by chance: an exact test.
 
