@@ -25,6 +25,7 @@ from hybridtrack.studies.regression import (
     UNCHANGED,
     UNTOLD,
     WORSE,
+    Change,
     Comparison,
     _Figure,
     _judge,
