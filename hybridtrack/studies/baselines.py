@@ -4,6 +4,7 @@ A baseline is one Parquet file. Its rows are those of the run's runs.parquet, a 
 without the quantities that the scenario doesn't have; its metadata say what made them.
 """
 
+import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,7 +46,8 @@ class Baseline(NamedTuple):
 def describe(folder: Path) -> Baseline:
     """A finished run as a baseline has it; its shards are read from the folder's runs.parquet."""
     manifest = results.require_complete(folder)
-    scenario = load(folder / results.CONFIG).resolved
+    experiment = load(folder / results.CONFIG)
+    scenario = experiment.resolved
     monte_carlo = {k: v for k, v in scenario["monte_carlo"].items() if k not in ("runs", "seed")}
     kept = {k: v for k, v in scenario.items() if k not in TOLD} | {"monte_carlo": monte_carlo}
     kept = json.loads(json.dumps(kept))
@@ -53,6 +55,9 @@ def describe(folder: Path) -> Baseline:
     for holder in (recording, recording.get("reference", {})):
         if "package" not in holder:
             holder.pop("file", None)  # lies elsewhere on another machine
+    if recording:  # by its times, since smoothed positions depend on the machine's last bits
+        times = hashlib.sha256(b"".join(case.times_s.tobytes() for case in experiment.cases))
+        recording["times"] = times.hexdigest()[:16]
     versions = manifest.get("versions", {})
     made = {name: str(versions[name]) for name in sorted(versions) if name != "pandas"}
     host = manifest.get("host", {})
