@@ -14,6 +14,26 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
+# What several commands take.
+ScenarioOrRun = Annotated[
+    str, typer.Argument(metavar="CONFIG|RUN_DIR", help="A scenario, or a run's folder.")
+]
+Runs = Annotated[int | None, typer.Option(help="Monte Carlo runs instead of the file's.")]
+Seed = Annotated[int | None, typer.Option(help="Random seed instead of the file's.")]
+Detect = Annotated[
+    str | None,
+    typer.Option(metavar="CHANGE", help="As many runs as find a change like 1% unpaired."),
+]
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Threads; all cores by default. Same bytes for any.")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value; may be repeated."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")]
+Json = Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")]
+
 
 def main() -> None:
     """Entry point of the console script."""
@@ -27,21 +47,14 @@ def main() -> None:
 )
 def run(
     config: Annotated[str, typer.Argument(help="A scenario's file, or a shipped one's name.")],
-    runs: Annotated[
-        int | None, typer.Option(help="Monte Carlo runs instead of the file's.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Random seed instead of the file's.")] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Threads; all cores by default. Same bytes for any.")
-    ] = None,
+    runs: Runs = None,
+    seed: Seed = None,
+    workers: Workers = None,
     out: Annotated[Path | None, typer.Option(help="Folder instead of runs/NAME-DIGEST.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Repeat a run that is there.")] = False,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value; may be repeated."),
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")] = False,
+    set_: Settings = None,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Run a scenario and print its table, its verdicts and its folder.
 
@@ -282,25 +295,14 @@ def ledger(
     "hybridtrack baseline my_scenario.yaml -o my_scenario.parquet --detect 1%",
 )
 def baseline(
-    config: Annotated[
-        str,
-        typer.Argument(metavar="CONFIG|RUN_DIR", help="A scenario, or a run's folder."),
-    ],
+    config: ScenarioOrRun,
     output: Annotated[Path, typer.Option("--output", "-o", help="The baseline's file.")],
-    runs: Annotated[
-        int | None, typer.Option(help="Monte Carlo runs instead of the file's.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Random seed instead of the file's.")] = None,
-    detect: Annotated[
-        str | None,
-        typer.Option(metavar="CHANGE", help="As many runs as find a change like 1% unpaired."),
-    ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Threads.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value; may be repeated."),
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
+    runs: Runs = None,
+    seed: Seed = None,
+    detect: Detect = None,
+    workers: Workers = None,
+    set_: Settings = None,
+    quiet: Quiet = False,
 ) -> None:
     """Write a baseline, which `check` compares with.
 
@@ -321,10 +323,7 @@ def baseline(
     "hybridtrack check runs/softbound_ex1-0123456789 --against softbound_ex1.parquet --junit r.xml",
 )
 def check(
-    config: Annotated[
-        str,
-        typer.Argument(metavar="CONFIG|RUN_DIR", help="A scenario, or a run's folder."),
-    ],
+    config: ScenarioOrRun,
     against: Annotated[Path, typer.Option(metavar="BASELINE", help="What `baseline` wrote.")],
     runs: Annotated[
         int | None, typer.Option(help="Monte Carlo runs; the baseline's by default.")
@@ -332,23 +331,17 @@ def check(
     seed: Annotated[
         int | None, typer.Option(help="Random seed; the baseline's by default, to be paired.")
     ] = None,
-    detect: Annotated[
-        str | None,
-        typer.Option(metavar="CHANGE", help="As many runs as find a change like 1% unpaired."),
-    ] = None,
+    detect: Detect = None,
     family_error: Annotated[
         float, typer.Option(help="Chance that any figure cries wolf, or a detectable change isn't.")
     ] = 1e-6,
-    workers: Annotated[int | None, typer.Option(min=1, help="Threads.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change a value; may be repeated."),
-    ] = None,
+    workers: Workers = None,
+    set_: Settings = None,
     all_: Annotated[bool, typer.Option("--all", help="Print every window's figures.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Results as JSON on stdout.")] = False,
+    json: Json = False,
     junit: Annotated[Path | None, typer.Option(help="Write JUnit XML to this file.")] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write a Markdown table to it.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress on stderr.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare a run with a baseline.
 

@@ -104,12 +104,12 @@ def in_recursion(**choices):
 def one_transition_fewer(estimator):
     """The hard bound counts from 1."""
 
-    def model(right, settings):
+    def bound(settings):
         if estimator.name == "hbf":
             settings = settings._replace(most_transitions=settings.most_transitions - 1)
-        return estimator.model(right, settings)
+        return estimator.bound(settings)
 
-    return estimator._replace(model=model)
+    return estimator._replace(bound=bound)
 
 
 def begun_as(kind):

@@ -322,7 +322,7 @@ def bound_filter(name, model, **settings):
     """The recursion's model of an estimator, and its choices."""
     estimator = estimators()[name]
     chosen = estimator.settings(**settings)
-    return estimator.model(model, chosen), estimator.recursion(chosen)
+    return estimator.prepare(chosen, model).model, estimator.recursion(chosen)
 
 
 def scans(seed, steps, n_y=2, lanes=3, scale=30.0):

@@ -314,7 +314,7 @@ def test_an_estimators_bound_is_its_models():
             if not hasattr(estimator, "model"):  # it has no other chain than this
                 assert name == "best_sequences"
                 continue
-            own = estimator.model(model, settings)
+            own = estimator.prepare(settings, model).model
             np.testing.assert_array_equal(chain.transition_matrix, own.transition_matrix)
             np.testing.assert_array_equal(
                 chain.initial_probabilities, own.initial_mode_probabilities

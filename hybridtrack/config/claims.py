@@ -37,7 +37,8 @@ def built_claim(
         _check_of_runs(claim, form, chosen, truth_modes, document, path)
     if claim.compare is None and claim.value is None:
         raise document.error(path, "'value' is missing in this claim on one figure; add it")
-    if claim.compare is None and claim.sign not in (None, *(("less", "greater") * (exact is None))):
+    signs = (None, "less", "greater") if exact is None else (None,)  # of a claim on one figure
+    if claim.compare is None and claim.sign not in signs:
         raise document.error(
             (*path, "sign"), f"'sign' {claim.sign} has no place in this claim; remove it"
         )

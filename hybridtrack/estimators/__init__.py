@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from hybridtrack.chains import Bound
+from hybridtrack.chains import Bound, on_supermodes
 from hybridtrack.estimators import _bank, _layout
 from hybridtrack.estimators._bank import NO_KNOWN_MODES, Recursion
 from hybridtrack.estimators._layout import Array, Estimates
@@ -109,21 +109,25 @@ class Estimator(Protocol):
         ...
 
 
+def _as_it_is(model: JumpMarkovModel, settings: Any) -> JumpMarkovModel:
+    return model
+
+
 def _no_bound(settings: Any) -> Bound:
     return Bound()
 
 
 class BankEstimator(NamedTuple):
-    """A multiple-model filter: a change of the model, and the recursion's choices."""
+    """A multiple-model filter: the recursion's choices, a change of the model, a bound."""
 
     name: str
     summary: str
     source: str
     settings: type[Any]
-    model: Callable[[JumpMarkovModel, Any], JumpMarkovModel]
     recursion: Callable[[Any], Recursion]
+    model: Callable[[JumpMarkovModel, Any], JumpMarkovModel] = _as_it_is  # of the bank's modes
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
-    bound: Callable[[Any], Bound] = _no_bound  # that `model` puts on the bank's chain
+    bound: Callable[[Any], Bound] = _no_bound  # on the chain of these
 
     @property
     def has_likelihoods(self) -> bool:
@@ -136,7 +140,10 @@ class BankEstimator(NamedTuple):
 
     def prepare(self, settings: Any, model: JumpMarkovModel) -> "Prepared":
         """The model on its own chain, as it is and as the kernel wants it."""
-        own = self.model(model, settings)
+        own, bound = self.model(model, settings), self.bound(settings)
+        if bound.is_set:
+            chain = bound.supermodes(own.transition_matrix, own.initial_mode_probabilities)
+            own = on_supermodes(own, chain)
         return Prepared(own, _layout.kernel_model(own))
 
     def begin(

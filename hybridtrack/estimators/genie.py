@@ -4,15 +4,10 @@ from typing import NamedTuple
 
 from hybridtrack.estimators import BankEstimator
 from hybridtrack.estimators._bank import INHERIT, Recursion
-from hybridtrack.models import JumpMarkovModel
 
 
 class Settings(NamedTuple):
     """The genie has no settings: it knows."""
-
-
-def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    return model
 
 
 def _recursion(settings: Settings) -> Recursion:
@@ -24,6 +19,5 @@ ESTIMATOR = BankEstimator(
     summary="Kalman filter that knows the true modes, as no filter can",
     source="Sigalov 2011, section IV",
     settings=Settings,
-    model=_model,
     recursion=_recursion,
 )

@@ -11,10 +11,9 @@ some 3 % of runs it holds a transition to be still missing for 100 steps and mor
 
 from typing import NamedTuple
 
-from hybridtrack.chains import Bound, on_supermodes
+from hybridtrack.chains import Bound
 from hybridtrack.estimators import BankEstimator
 from hybridtrack.estimators._bank import MIXING, Recursion
-from hybridtrack.models import JumpMarkovModel
 
 
 class Settings(NamedTuple):
@@ -27,11 +26,6 @@ def _bound(settings: Settings) -> Bound:
     return Bound(most_transitions=settings.most_transitions)
 
 
-def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    chain = (model.transition_matrix, model.initial_mode_probabilities)
-    return on_supermodes(model, _bound(settings).supermodes(*chain))
-
-
 def _recursion(settings: Settings) -> Recursion:
     return Recursion(interaction=MIXING)
 
@@ -41,7 +35,6 @@ ESTIMATOR = BankEstimator(
     summary="hard bound filter: an IMM over modes and the number of transitions so far",
     source="as described by Sigalov 2011, sections I and III-C",
     settings=Settings,
-    model=_model,
     recursion=_recursion,
     limits={"most_transitions": (0.0, 100.0)},
     bound=_bound,

@@ -4,15 +4,10 @@ from typing import NamedTuple
 
 from hybridtrack.estimators import BankEstimator
 from hybridtrack.estimators._bank import MIXING, Recursion
-from hybridtrack.models import JumpMarkovModel
 
 
 class Settings(NamedTuple):
     """The IMM has no settings of its own."""
-
-
-def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    return model
 
 
 def _recursion(settings: Settings) -> Recursion:
@@ -24,6 +19,5 @@ ESTIMATOR = BankEstimator(
     summary="interacting multiple models (IMM)",
     source="Blom and Bar-Shalom 1988; Hwang, Balakrishnan, Tomlin 2006, eqs. 9-12",
     settings=Settings,
-    model=_model,
     recursion=_recursion,
 )

@@ -24,7 +24,6 @@ from hybridtrack.estimators._bank import (
     RESIDUAL_MEAN,
     Recursion,
 )
-from hybridtrack.models import JumpMarkovModel
 
 
 class Settings(NamedTuple):
@@ -37,10 +36,6 @@ class Settings(NamedTuple):
     residual_floor_m: float
     residual_error: Literal["recursive", "zero"] = "recursive"
     residual_mean: Literal["own", "common"] = "own"
-
-
-def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    return model
 
 
 def _recursion(settings: Settings) -> Recursion:
@@ -57,7 +52,6 @@ ESTIMATOR = BankEstimator(
     summary="residual-mean IMM (RMIMM): likelihoods over the norm of the residual's mean",
     source="Hwang, Balakrishnan, Tomlin 2006, eqs. 26-29, with the indices as read here",
     settings=Settings,
-    model=_model,
     recursion=_recursion,
     limits={"residual_floor_m": (1e-300, None)},
 )

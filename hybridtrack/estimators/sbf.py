@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-from hybridtrack.chains import Bound, on_supermodes
+from hybridtrack.chains import Bound
 from hybridtrack.estimators import BankEstimator
 from hybridtrack.estimators._bank import MIXING, Recursion
-from hybridtrack.models import JumpMarkovModel
 
 
 class Settings(NamedTuple):
@@ -24,11 +23,6 @@ def _bound(settings: Settings) -> Bound:
     return Bound(continuation_probability=settings.continuation_probability, leak=settings.leak)
 
 
-def _model(model: JumpMarkovModel, settings: Settings) -> JumpMarkovModel:
-    chain = (model.transition_matrix, model.initial_mode_probabilities)
-    return on_supermodes(model, _bound(settings).supermodes(*chain))
-
-
 def _recursion(settings: Settings) -> Recursion:
     return Recursion(interaction=MIXING)
 
@@ -38,7 +32,6 @@ ESTIMATOR = BankEstimator(
     summary="soft bound filter: an IMM over modes that may have ended",
     source="Sigalov 2011, section III",
     settings=Settings,
-    model=_model,
     recursion=_recursion,
     limits={"continuation_probability": (0.0, 1.0), "leak": (0.0, 1.0)},
     bound=_bound,
