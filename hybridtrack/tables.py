@@ -60,6 +60,12 @@ def figure(value: float, error: float) -> str:
     return f"{value:.{min(max(first - last, 0), MOST_DIGITS)}e}±{error:.0e}"
 
 
+def estimate(value: float, error: float) -> str:
+    """As `figure`; an error below the value's last bit is rounding, of what every run has alike."""
+    alike = math.isfinite(value) and error < math.ulp(value)
+    return figure(value, 0.0 if alike else error)
+
+
 def counted(number: int, thing: str) -> str:
     """'1 run', '2,000 runs'."""
     return f"{number:,} {thing}{'s' * (number != 1)}"
@@ -132,7 +138,7 @@ Columns = tuple[tuple[str, str], ...]  # metrics and their headings
 
 def _summary(heading: str, summary: Rows, labels: list[str], shown: Columns) -> Table:
     figures = {
-        (row["estimator"], row["metric"]): figure(row["value"], row["standard_error"])
+        (row["estimator"], row["metric"]): estimate(row["value"], row["standard_error"])
         for row in summary
         if row["window"] == "all"
     }
@@ -141,7 +147,7 @@ def _summary(heading: str, summary: Rows, labels: list[str], shown: Columns) -> 
 
 def _ratios(comparisons: Rows, reference: str, shown: Columns) -> Table:
     figures = {
-        (row["first"], row["metric"]): figure(row["ratio"], row["ratio_standard_error"])
+        (row["first"], row["metric"]): estimate(row["ratio"], row["ratio_standard_error"])
         for row in comparisons
         if row["window"] == "all"
     }
@@ -194,7 +200,7 @@ def claimed(row: Mapping[Any, Any]) -> str:
 def obtained(row: Mapping[Any, Any]) -> str:
     """What we get: the figure, or the paired difference."""
     difference = "Δ = " if row["published"] is None else ""
-    return difference + figure(row["ours"], row["standard_error"])
+    return difference + estimate(row["ours"], row["standard_error"])
 
 
 def surprises(path: Path) -> list[str]:

@@ -97,6 +97,23 @@ def test_counts_agree_with_their_noun():
     assert tables.counted(0, "step") == "0 steps"
 
 
+@pytest.mark.parametrize(
+    ("value", "error", "told"),
+    [
+        (0.6894482687867965, 1.2e-18, "0.6894±0"),
+        (-0.6894482687867965, 1.2e-18, "-0.6894±0"),
+        (0.5, 2e-16, "5.000000e-01±2e-16"),
+        (0.0, 3e-8, "0e+00±3e-08"),
+        (17.94, 0.04, "17.94±0.04"),
+        (0.6, math.nan, "0.6"),
+        (math.nan, math.nan, ""),
+        (math.inf, 0.1, "inf±0.1"),
+    ],
+)
+def test_an_error_below_the_last_bit_is_none(value, error, told):
+    assert tables.estimate(value, error) == told
+
+
 FIGURES = ("123456.789±0.001", "1.500e-09±2e-12", "0.5±inf", "3.140e+30±2e+27")
 
 
