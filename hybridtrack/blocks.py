@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridtrack.config import Experiment, Window
+from hybridtrack.delays import Delays, DelayTally, merge_delays
 from hybridtrack.errors import Stopped
 from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates
 from hybridtrack.models import Array, Itself, JumpMarkovModel, ModeBank
@@ -20,6 +21,7 @@ from hybridtrack.simulation import (
     Case,
     Scans,
     TruthSpan,
+    sojourns,
     spans,
     step_lengths,
     two_point_start,
@@ -75,6 +77,7 @@ class BlockResult(NamedTuple):
     steps: dict[Series, Moments]  # arrays (n_steps,)
     sums: dict[Cell, tuple[Array, Array]]  # (runs,) sums over steps, and their numbers
     final_bins: dict[str, Array]  # by estimator (3 * BINS, runs), see tallies.Totals
+    delays: dict[str, Delays]  # by estimator
     status: dict[str, NDArray[np.int64]]  # by estimator (runs,): 0, or the step of divergence
     tracks: list[Track]
 
@@ -85,6 +88,7 @@ class GroupStatistics(NamedTuple):
     steps: dict[Series, Moments]
     windows: dict[Cell, SumMoments]
     final_bins: dict[str, VectorMoments]
+    delays: dict[str, Delays]
     diverged: dict[str, int]
 
 
@@ -99,6 +103,7 @@ def merge(a: GroupStatistics, b: GroupStatistics) -> GroupStatistics:
         _merged(a.steps, b.steps, merge_moments),
         _merged(a.windows, b.windows, merge_sum_moments),
         {label: merge_vectors(a.final_bins[label], b.final_bins[label]) for label in a.final_bins},
+        {label: merge_delays(a.delays[label], b.delays[label]) for label in a.delays},
         {key: a.diverged[key] + b.diverged[key] for key in a.diverged},
     )
 
@@ -126,7 +131,7 @@ def summarise(result: BlockResult) -> GroupStatistics:
         for label, sums in result.final_bins.items()
     }
     diverged = {label: int((status > 0).sum()) for label, status in result.status.items()}
-    return GroupStatistics(result.steps, windows, final_bins, diverged)
+    return GroupStatistics(result.steps, windows, final_bins, result.delays, diverged)
 
 
 def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) -> NDArray[np.bool_]:
@@ -188,6 +193,7 @@ class _Block:
         self._told = {c.label for c in chosen if c.estimator.is_told_modes(c.settings)}
         self._sheet = blank_sheet(SPAN_STEPS, self._lanes)
         self._tallies: dict[str, Tally] = {}
+        self._watched: dict[str, DelayTally] = {}
         self._shares = {
             name: Moments(*(np.zeros(self._n_steps) for _ in range(3)))
             for name in experiment.truth_modes
@@ -228,6 +234,7 @@ class _Block:
             steps[TRUTH, "final_mode_probability"] = self._final_share
         sums: dict[Cell, tuple[Array, Array]] = {}
         final_bins: dict[str, Array] = {}
+        delays: dict[str, Delays] = {}
         for label in self._status:  # in the scenario's order
             if label in self._tallies:
                 tally = self._tallies[label]
@@ -235,9 +242,15 @@ class _Block:
                 sums |= {(label, *cell): totals for cell, totals in tally.sums()}
                 if tally.final_bins.size:
                     final_bins[label] = tally.final_bins
+            if label in self._watched:
+                watched = self._watched[label]
+                delays[label] = watched.delays(self._status[label] == 0)
+                if self._simulation.fixed is not None:
+                    shares = watched.shares().items()
+                    steps |= {(label, f"mode_estimate:{mode}"): m for mode, m in shares}
         kept = sorted(self._tracks.items(), key=lambda item: self._place(item[0][1]))
         tracks = [Track(*key, values) for key, values in kept]
-        return BlockResult(self._task, steps, sums, final_bins, self._status, tracks)
+        return BlockResult(self._task, steps, sums, final_bins, delays, self._status, tracks)
 
     def _place(self, label: str) -> int:
         """A label's place in the scenario's order; truth and measurements come first."""
@@ -281,9 +294,17 @@ class _Block:
             experiment.estimators, key=lambda c: c.label != experiment.compare_with
         ):
             prepared = self._first[chosen.label]
-            self._running[chosen.label] = chosen.estimator.begin(
-                chosen.settings, prepared, mean, stop
-            )
+            running = chosen.estimator.begin(chosen.settings, prepared, mean, stop)
+            self._running[chosen.label] = running
+            if experiment.switches(self._task.case) and len(running.mode_names) > 1:
+                self._watched[chosen.label] = DelayTally(
+                    experiment.truth_modes,
+                    running.mode_names,
+                    self._n_steps,
+                    self._lanes,
+                    self._task.runs,
+                    sojourns(self._case.truth),
+                )
 
     def _prepared(self, span: slice) -> dict[str, Any]:
         """Each estimator for the steps of a span; estimators of one bank share its matrices."""
@@ -317,6 +338,8 @@ class _Block:
             )
             self._note_status(span, label, estimates)
             self._score(span, label, scans, held, estimates)
+            if label in self._watched:
+                self._watched[label].add(span.start, scans.truth.mode, estimates.mode_probabilities)
             self._keep_estimates(span, label, running, estimates)
 
     def _true_modes(self, running: AtWork, scans: Scans) -> Array:

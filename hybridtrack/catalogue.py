@@ -1,5 +1,6 @@
 """What there is to choose from, by name, with a line each."""
 
+from hybridtrack.analyses import analyses
 from hybridtrack.config import shipped
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
@@ -11,7 +12,7 @@ def catalogue() -> dict[str, dict[str, str]]:
     return {
         "estimators": {name: e.summary for name, e in estimators().items()},
         "motions": {name: m.summary.rstrip(".") for name, m in MOTION_MODELS.items()},
-        "analyses": {},
+        "analyses": {name: one.summary for name, one in analyses().items()},
         "metrics": {name: m.summary for name, m in METRICS.items()}
         | {CALIBRATION: "mean distance of that probability from how often it came true (ECE)"},
         "scenarios": {name: _title(name) for name in shipped()},

@@ -62,6 +62,47 @@ SCHEMAS = {
             ("standard_error", pa.float64()),
         ]
     ),
+    "delays": pa.schema(
+        [
+            ("case", pa.string()),
+            ("estimator", pa.string()),
+            ("switch", pa.int64()),
+            ("from_mode", pa.string()),
+            ("to_mode", pa.string()),
+            ("step", pa.int64()),
+            ("time_s", pa.float64()),
+            ("sojourns", pa.int64()),
+            ("averaged_delay_steps", pa.float64()),
+            ("averaged_delay_steps_low", pa.float64()),
+            ("averaged_delay_steps_high", pa.float64()),
+            ("detected", pa.int64()),
+            ("missed", pa.int64()),
+            ("unfinished", pa.int64()),
+            ("first_step_share", pa.float64()),
+            ("first_step_share_standard_error", pa.float64()),
+            ("detection_delay_steps", pa.float64()),
+            ("detection_delay_steps_standard_error", pa.float64()),
+            ("median_delay_steps", pa.float64()),
+            ("missed_share", pa.float64()),
+            ("missed_share_standard_error", pa.float64()),
+            ("false_switches", pa.float64()),
+            ("false_switches_standard_error", pa.float64()),
+        ]
+    ),
+    "delay_distribution": pa.schema(
+        [
+            ("case", pa.string()),
+            ("estimator", pa.string()),
+            ("switch", pa.int64()),
+            ("from_mode", pa.string()),
+            ("to_mode", pa.string()),
+            ("delay_steps", pa.int64()),
+            ("at_risk", pa.int64()),
+            ("detected", pa.int64()),
+            ("probability", pa.float64()),
+            ("standard_error", pa.float64()),
+        ]
+    ),
     "published": pa.schema(
         [
             ("claim", pa.string()),

@@ -24,6 +24,8 @@ from hybridtrack.blocks import (
 )
 from hybridtrack.compiled import PACKAGE, host_processor, source_digest
 from hybridtrack.config import Experiment, dump
+from hybridtrack.delays import Delays
+from hybridtrack.detections import delay_rows
 from hybridtrack.executors import in_order
 from hybridtrack.results import RunFolder
 from hybridtrack.simulation import BLOCK_RUNS
@@ -50,6 +52,9 @@ def digest(experiment: Experiment) -> str:
     """What a run folder is named by: the scenario without `runs`, its recordings, our sources."""
     resolved = json.loads(json.dumps(experiment.resolved))
     del resolved["monte_carlo"]["runs"]
+    resolved.pop("analyses", None)
+    claims = resolved.pop("published", [])
+    resolved["published"] = [claim for claim in claims if "analysis" not in claim]
     recording = resolved["truth"].get("recording", {})
     for holder in (recording, recording.get("reference", {})):
         holder.pop("file", None)  # what was recorded counts, not where the file lies
@@ -115,6 +120,9 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
         folder.write_table("summary", outcomes.summary_rows(experiment, merged))
         folder.write_table("comparisons", outcomes.comparisons_rows(experiment, pairs))
         folder.write_table("reliability", outcomes.reliability_rows(experiment, merged))
+        delays = delay_rows(experiment, merged)
+        folder.write_table("delays", delays.switches)
+        folder.write_table("delay_distribution", delays.distribution)
         folder.write_table("published", outcomes.published_rows(experiment, pairs, merged))
         manifest |= {
             "finished": _now(),
@@ -193,6 +201,7 @@ def _pack(group: GroupStatistics, tracks: list[Track]) -> dict[str, Any]:
         "steps": [list(key) for key in group.steps],
         "windows": [list(key) for key in group.windows],
         "final_bins": list(group.final_bins),
+        "delays": list(group.delays),
         "diverged": group.diverged,
         "tracks": [[t.run, t.estimator, t.quantity] for t in tracks],
     }
@@ -204,6 +213,10 @@ def _pack(group: GroupStatistics, tracks: list[Track]) -> dict[str, Any]:
         **{
             f"final_{field}": np.array([getattr(m, field) for m in group.final_bins.values()])
             for field in VectorMoments._fields
+        },
+        **{
+            f"delays_{field}": np.array([getattr(d, field) for d in group.delays.values()])
+            for field in Delays._fields
         },
     }
 
@@ -220,11 +233,18 @@ def _unpack(arrays: dict[str, Any]) -> tuple[GroupStatistics, list[Track]]:
         label: VectorMoments(*moments)
         for label, moments in zip(keys["final_bins"], bins, strict=True)
     }
+    followed = zip(*(arrays[f"delays_{field}"] for field in Delays._fields), strict=True)
+    delays = {
+        label: Delays(detected, missed, unfinished, SumMoments(*false_switches))
+        for label, (detected, missed, unfinished, false_switches) in zip(
+            keys["delays"], followed, strict=True
+        )
+    }
     tracks = [
         Track(int(k[0]), str(k[1]), str(k[2]), a)
         for k, a in zip(keys["tracks"], arrays["tracks"], strict=True)
     ]
-    return GroupStatistics(steps, windows, final_bins, keys["diverged"]), tracks
+    return GroupStatistics(steps, windows, final_bins, delays, keys["diverged"]), tracks
 
 
 # ---- what made it ----------------------------------------------------------------------------

@@ -6,6 +6,7 @@ depends neither on how many runs were asked for nor on the length of spans.
 """
 
 import enum
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -43,12 +44,13 @@ def stream(seed: int, case: int, block: int, purpose: Purpose) -> np.random.Gene
 
 
 class Leg(NamedTuple):
-    """A straight flight or a coordinated turn (an exact arc) until `until_s`."""
+    """A straight flight, a coordinated turn (an exact arc) or a constant acceleration."""
 
     until_s: float
     turn_rate_rad_s: float  # positive to the right: headings run clockwise from north
-    speed_m_s: float
+    speed_m_s: float | None  # None: as the leg before ends
     mode: int
+    acceleration_m_s2: tuple[float, float] = (0.0, 0.0)  # east, north; not in a turn
 
 
 class FixedTruth(NamedTuple):
@@ -64,7 +66,8 @@ def fly(
 ) -> FixedTruth:
     """Fly the legs from a start at times_s[0] and note the state (x, vx, y, vy) at every time.
 
-    Coordinated turns are exact circular arcs. A step's mode is that of the leg in which it ends.
+    Turns are exact circular arcs, accelerations exact parabolas; the first leg has a speed. A
+    step's mode is that of the leg in which it ends.
     """
     state = np.empty((len(times_s), 4))
     mode = np.empty(len(times_s), dtype=np.int64)
@@ -72,31 +75,45 @@ def fly(
     ends = np.array([leg.until_s for leg in legs]) + slack_s
     index = np.minimum(np.searchsorted(ends, times_s, side="left"), len(legs) - 1)
     position, heading, begin = np.array(position_m, dtype=float), heading_rad, float(times_s[0])
+    speed = 0.0
     for number, leg in enumerate(legs):
         here = index == number
-        state[here] = _arc(leg, times_s[here] - begin, position, heading)
+        speed = speed if leg.speed_m_s is None else leg.speed_m_s
+        start = (speed, position, heading)
+        state[here] = _along(leg, times_s[here] - begin, *start)
         mode[here] = leg.mode
-        last = _arc(leg, np.array([leg.until_s - begin]), position, heading)[0]
+        last = _along(leg, np.array([leg.until_s - begin]), *start)[0]
+        duration = leg.until_s - begin
         position, begin = last[[0, 2]], leg.until_s
-        duration = leg.until_s - (float(times_s[0]) if number == 0 else legs[number - 1].until_s)
-        heading += leg.turn_rate_rad_s * duration
+        if any(leg.acceleration_m_s2):
+            speed, heading = math.hypot(last[1], last[3]), math.atan2(last[1], last[3])
+        else:
+            heading += leg.turn_rate_rad_s * duration
     return FixedTruth(state, mode, ("x", "vx", "y", "vy"))
 
 
-def _arc(leg: Leg, elapsed_s: Array, position: Array, heading: float) -> Array:
-    """The chord of an arc: as long as v t sin(a/2)/(a/2), halfway between the headings."""
+def _along(leg: Leg, elapsed_s: Array, speed: float, position: Array, heading: float) -> Array:
+    """States (n, 4) on a leg.
+
+    The chord of an arc is as long as v t sin(a/2)/(a/2), halfway between the headings.
+    """
     angle = leg.turn_rate_rad_s * elapsed_s
-    chord = leg.speed_m_s * elapsed_s * np.sinc(angle / (2 * np.pi))
+    chord = speed * elapsed_s * np.sinc(angle / (2 * np.pi))
     bearing = heading + angle / 2
-    return np.stack(
+    state = np.stack(
         [
             position[0] + chord * np.sin(bearing),
-            leg.speed_m_s * np.sin(heading + angle),
+            speed * np.sin(heading + angle),
             position[1] + chord * np.cos(bearing),
-            leg.speed_m_s * np.cos(heading + angle),
+            speed * np.cos(heading + angle),
         ],
         axis=1,
     )
+    if any(leg.acceleration_m_s2):
+        a = np.array(leg.acceleration_m_s2)
+        state[:, [0, 2]] += np.multiply.outer(elapsed_s**2 / 2, a)
+        state[:, [1, 3]] += np.multiply.outer(elapsed_s, a)
+    return state
 
 
 # ---- truth and measurements of a span --------------------------------------------------------
@@ -265,6 +282,14 @@ class BlockSimulation:
             return truth
         step = np.arange(span.start, span.stop)[:, np.newaxis] + 1
         return truth._replace(final=(step >= self._last_switch).astype(np.float64))
+
+
+def sojourns(truth: Truth) -> Modes | None:
+    """How many steps each mode lasts, from the start on (n_sojourns,); None where runs differ."""
+    if isinstance(truth, ChainTruth):
+        return None
+    switched = np.flatnonzero(truth.mode[2:] != truth.mode[1:-1]) + 1
+    return np.diff(np.concatenate([[0], switched, [len(truth.mode) - 1]]))
 
 
 def _since_switch(times_s: Array, modes: Modes) -> Array:

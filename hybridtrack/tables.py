@@ -1,9 +1,9 @@
 """A run folder's results as text and as JSON; tables in, lines out."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich import box
 from rich.console import Console, RenderableType
@@ -34,6 +34,7 @@ MOST_DECIMALS = 6  # more than that, and figures of a million on, take an expone
 MOST_DIGITS = 6  # of a figure with an exponent, after its point
 SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
 WIDEST = 10_000
+MOST_SWITCHES = 6  # whose delays are printed
 VERDICT_STYLES = {
     "reproduced": "green",
     "reproduced with stated assumptions": "green",
@@ -77,13 +78,52 @@ def show(path: Path, console: Console) -> None:
     No digit and no letter is left out: a table too wide for a terminal folds its names, then goes
     beyond the edge; on anything else than a terminal it is as wide as it needs to be.
     """
+    _print(_parts(path), console)
+
+
+def show_analysis(record: Mapping[str, Any], console: Console) -> None:
+    """Print a finished analysis, of which analysis.json is given, in the same way."""
+    _print(_parts_of(record), console)
+
+
+def _print(parts: Iterable[RenderableType], console: Console) -> None:
     with console.capture() as captured:
-        for part in _parts(path):
+        for part in parts:
             if isinstance(part, Table) and not part.expand:
                 part.width = _width(part, console)
             console.print(part, crop=False)
     lines = [line.rstrip() for line in captured.get().splitlines()]
     console.file.write("\n".join([*lines, ""]))
+
+
+def _parts_of(record: Mapping[str, Any]) -> Iterator[RenderableType]:
+    yield Text(f"{record['title']}: {record['summary']}\n")
+    if record["shown"]:
+        table = _plain_table()
+        for i, heading in enumerate(record["shown"]):
+            justify: Literal["left", "right"] = "left" if i == 0 else "right"
+            table.add_column(Text(heading), justify=justify, overflow="fold", no_wrap=i > 0)
+        for cells in zip(*record["shown"].values(), strict=True):
+            table.add_row(*map(Text, cells))
+        yield table
+        yield ""
+    for sentence in record["conclusions"]:
+        yield Text(sentence)
+    if record["notes"]:
+        yield ""
+        yield from (_hanging(note) for note in record["notes"])
+    if record["published"]:
+        yield ""
+        yield _published(record["published"])
+
+
+def _hanging(note: str) -> Table:
+    """A note behind a dash, its lines below one another."""
+    grid = Table.grid(padding=(0, 1), expand=True)
+    grid.add_column(width=1)
+    grid.add_column(ratio=1)
+    grid.add_row("-", Text(note, style="dim"))
+    return grid
 
 
 def _parts(path: Path) -> Iterator[RenderableType]:
@@ -104,6 +144,7 @@ def _parts(path: Path) -> Iterator[RenderableType]:
         yield ""
         labels = [label for label in manifest["estimators"] if label in told]
         yield _summary("mode is the last", summary, labels, FINAL_MODE)
+    yield from _delays(results.read_rows(path, "delays"))
     for label, count in manifest.get("diverged", {}).items():
         yield Text(
             f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
@@ -131,6 +172,37 @@ def _width(table: Table, console: Console) -> int:
 
 def _plain_table() -> Table:
     return Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1), show_edge=False)
+
+
+def _delays(rows: Rows) -> Iterator[RenderableType]:
+    """Steps until switches are noticed, a column for each; the start is none."""
+    keys = ("case", "switch", "from_mode", "to_mode")
+    found = [row for row in rows if row["from_mode"] is not None]
+    switches = list(dict.fromkeys(tuple(row[key] for key in keys) for row in found))
+    if not switches:
+        return
+    yield ""
+    if len(switches) > MOST_SWITCHES or len({switch[0] for switch in switches}) > 1:
+        yield Text(f"delays of {len(switches):,} switches: see delays.parquet")
+        return
+    table = _plain_table()
+    table.add_column(Text("delay in steps"), overflow="fold")
+    for switch in switches:
+        time_s = next(row["time_s"] for row in found if row["switch"] == switch[1])
+        when = "" if time_s is None else f"\n{time_s:g} s"
+        table.add_column(Text(f"{switch[2]}\nto {switch[3]}{when}"), justify="right", no_wrap=True)
+    cells = {(row["estimator"], *(row[key] for key in keys)): delay(row) for row in found}
+    for label in dict.fromkeys(row["estimator"] for row in found):
+        table.add_row(Text(label), *(cells.get((label, *switch), "") for switch in switches))
+    yield table
+
+
+def delay(row: Mapping[str, Any]) -> str:
+    """Of the run-averaged mode estimate; of the runs noticed, where each has its own switches."""
+    averaged = row["averaged_delay_steps"]
+    if averaged is None:
+        return figure(row["detection_delay_steps"], row["detection_delay_steps_standard_error"])
+    return "never" if math.isinf(averaged) else f"{averaged:.0f}"
 
 
 Columns = tuple[tuple[str, str], ...]  # metrics and their headings
@@ -199,6 +271,8 @@ def claimed(row: Mapping[Any, Any]) -> str:
 
 def obtained(row: Mapping[Any, Any]) -> str:
     """What we get: the figure, or the paired difference."""
+    if "shown" in row:
+        return str(row["shown"])
     difference = "Δ = " if row["published"] is None else ""
     return difference + estimate(row["ours"], row["standard_error"])
 
@@ -207,9 +281,19 @@ def surprises(path: Path) -> list[str]:
     """A sentence for every window without a step and every verdict that isn't the expected one."""
     there = {row["window"] for row in results.read_rows(path, "summary")}
     empty = [w for w in results.require_complete(path)["windows"] if w not in there]
-    return [f"window '{w}' holds no measured step, so it has no figures" for w in empty] + [
+    said = [f"window '{w}' holds no measured step, so it has no figures" for w in empty]
+    return said + _unexpected(results.read_rows(path, "published"))
+
+
+def surprises_of(record: Mapping[str, Any]) -> list[str]:
+    """The same of an analysis' verdicts."""
+    return _unexpected(record["published"])
+
+
+def _unexpected(published: Rows) -> list[str]:
+    return [
         f"'{row['claim']}' came out as: {row['verdict']}; expected: {row['expected_verdict']}"
-        for row in results.read_rows(path, "published")
+        for row in published
         if row["differs"]
     ]
 
@@ -219,7 +303,7 @@ def as_json(path: Path) -> dict[str, Any]:
     manifest = results.require_complete(path)
     tables = {
         name: [_finite(row) for row in results.read_rows(path, name)]
-        for name in ("summary", "comparisons", "reliability", "published")
+        for name in ("summary", "comparisons", "reliability", "delays", "published")
     }
     return {
         "folder": str(path),

@@ -13,7 +13,8 @@ didn't diverge, leaves nothing to judge.
 
 import math
 import re
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
 
 from hybridtrack.statistics import Estimate, Paired
 
@@ -47,6 +48,30 @@ class Claim(NamedTuple):
     expect: str  # the verdict when last looked at
     because: str
     exact: float | None = None  # what follows from the scenario alone
+
+
+class AnalysisClaim(NamedTuple):
+    """A published claim on a figure of an analysis, or on which of two is the larger."""
+
+    claim: str
+    analysis: str
+    figure: str  # a column of the analysis' table
+    where: Mapping[str, Any]  # the row's cells by column
+    than: Mapping[str, Any] | None  # another row's, of a comparison
+    value: float | None
+    tolerance: float
+    sign: str | None  # less | greater
+    expect: str
+    because: str
+    place: str  # where the scenario says it
+
+
+class Interval(NamedTuple):
+    """A figure, and what it may be: what chance allows it, or itself where there is no chance."""
+
+    value: float
+    low: float
+    high: float
 
 
 class Outcome(NamedTuple):
@@ -85,6 +110,24 @@ def judge_exact(claim: Claim) -> Outcome:
     assert claim.value is not None
     met = abs(claim.exact - claim.value) <= claim.tolerance
     return _outcome(claim, ours, REPRODUCED if met else NOT_REPRODUCED)
+
+
+def judge_interval(claim: AnalysisClaim, ours: Interval, assumptions: bool) -> str:
+    """The verdict on a figure of an analysis, or on the difference of two (first - second)."""
+    if math.isnan(ours.value):
+        return NOT_REPRODUCED
+    if claim.sign is not None:
+        bound = 0.0 if claim.value is None else claim.value
+        ours = ours if claim.sign == "less" else Interval(-ours.value, -ours.high, -ours.low)
+        bound = bound if claim.sign == "less" else -bound
+        if ours.high < bound:
+            return REPRODUCED
+        return NOT_REPRODUCED if ours.low >= bound else UNDECIDED
+    assert claim.value is not None
+    low, high = claim.value - claim.tolerance, claim.value + claim.tolerance
+    if low <= ours.low and ours.high <= high:
+        return ASSUMED if assumptions else REPRODUCED
+    return NOT_REPRODUCED if ours.high < low or ours.low > high else UNDECIDED
 
 
 def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:

@@ -9,12 +9,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hybridtrack import config, experiment, results, tables
+from hybridtrack import config, dossiers, experiment, results, tables
+from hybridtrack.analyses import analyses
+from hybridtrack.studies import analysis as studies
 from hybridtrack.studies.ledger import markdown
 
 README = Path(__file__).parent.parent / "README.md"
 PART = re.compile(r"(<!-- generated: (?P<what>[^>]+) -->\n)(?P<text>.*?)(<!-- end -->)", re.DOTALL)
 SHOWN = ("rmimm_fig5", "recorded_flight")
+ANALYSED = {"delay": "mode_delay_fig4"}  # whose output is shown
 EXAMPLES = {  # of Sigalov 2011, and what the truth is in each
     "softbound_ex1": "a soft bound",
     "softbound_ex2": "at most 4 transitions",
@@ -42,21 +45,54 @@ def finished_runs(root: Path) -> dict[str, Path]:
         shipped = config.load(name, ["monte_carlo.runs=2400", best, "compare_with=BEST"])
         folders[f"{name}+BEST"] = root / f"{name}+BEST"
         experiment.run(shipped, folders[f"{name}+BEST"], 2, lambda done, total: None)
-    return folders
+    return folders | finished_analyses(root, folders)
+
+
+def finished_analyses(root: Path, folders: dict[str, Path]) -> dict[str, Path]:
+    """Every analysis that is shown, or that claims are on; `analyze NAME SCENARIO` by its words."""
+    found = {}
+    for name in config.shipped():
+        shipped = config.load(name)
+        claimed = {claim.analysis for claim in shipped.analysis_claims}
+        for analysis, one in analyses().items():
+            if analysis not in claimed and ANALYSED.get(analysis) != name:
+                continue
+            run = None
+            if one.wants_run is not None:
+                wanted = one.wants_run(shipped)
+                shipped = config.load(name, wanted)
+                run = root / f"{name}-for-{analysis}" if wanted else folders.get(name, root / name)
+                experiment.run(shipped, run, 2, lambda done, total: None)
+            words = f"analyze {analysis} {name}"
+            found[words] = root / words.replace(" ", "-")
+            studies.analyse(shipped, one, found[words], run)
+    return found
 
 
 def generated(what: str, folders: dict[str, Path]) -> str:
     """The text of one part."""
     if what == "ledger":
-        return (
-            "\n" + markdown([folders[n] for n in config.shipped() if config.load(n).claims]) + "\n"
-        )
+        claimed = [folders[n] for n in config.shipped() if config.load(n).claims]
+        claimed += [folder for words, folder in folders.items() if words.startswith("analyze ")]
+        return "\n" + markdown(claimed) + "\n"
     if what == "ratios to the genie":
         return "\n" + ratios(folders, EXAMPLES, ("SBF", "HBF", "IMM", "KF_m2")) + "\n"
     if what == "ratios to the best sequences":
         return "\n" + ratios(folders, YARDSTICKS, ("genie", "SBF", "HBF", "IMM")) + "\n"
-    name = what.removeprefix("hybridtrack run ")
     out = io.StringIO()
+    if what.startswith("hybridtrack analyze "):
+        words = what.removeprefix("hybridtrack ")
+        words = words if words in folders else f"{words} {ANALYSED[words.split()[1]]}"
+        record = dossiers.read(folders[words])
+        assert record is not None
+        console = Console(file=out, width=80, highlight=False, no_color=True)
+        tables.show_analysis(record | {"published": []}, console)
+        folder = f"runs/{record['scenario']}-{record['analysis']}-DIGEST"
+        lines = [line.rstrip() for line in out.getvalue().splitlines()]
+        lines += ["..."] * bool(record["published"])  # the verdicts, which the ledger has
+        lines += [f"figures: {folder}/figures", folder]
+        return "\n".join(["```text", f"$ {what}", *lines, "```", ""])
+    name = what.removeprefix("hybridtrack run ")
     tables.show(folders[name], Console(file=out, width=80, highlight=False, no_color=True))
     lines = [line.rstrip() for line in out.getvalue().splitlines()]
     lines += [f"figures: runs/{name}-DIGEST/figures", f"runs/{name}-DIGEST"]

@@ -58,7 +58,7 @@ def test_a_bound_is_a_figure_with_a_sign(tmp_path):
         ("figure: manoeuvring_index, mode: m1", "'value' is missing in this claim on one figure"),
         (
             "figure: manoeuvring_indx, mode: m1, value: 1",
-            "'figure' is manoeuvring_indx; it must be",
+            "'figure' is manoeuvring_indx, which needs an 'analysis'",
         ),
         ("figure: manoeuvring_index, value: 1", "'mode' is missing: 'manoeuvring_index' is one mo"),
         ("figure: manoeuvring_index, mode: m3, value: 1", "mode 'm3' is not defined; there are m1"),

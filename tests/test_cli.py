@@ -371,7 +371,7 @@ def test_interrupts_anywhere_are_one_line_and_130(finished, place):
 
 
 def test_an_interrupt_tells_what_is_kept(tmp_path):
-    from hybridtrack.cli import _what_is_kept
+    from hybridtrack.options import _what_is_kept
 
     assert "no shard was finished" in _what_is_kept(tmp_path)
     (tmp_path / "shards").mkdir()

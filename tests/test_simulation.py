@@ -175,6 +175,27 @@ def test_a_steps_mode_isnt_decided_by_rounding():
     assert fly(legs, times_s, (0.0, 0.0), 0.0).mode.tolist() == [0] * 4 + [1] * 3 + [0] + [1] * 2
 
 
+def test_an_acceleration_is_an_exact_parabola_and_the_next_leg_goes_on_from_it():
+    times_s = np.array([0.0, 4.0, 7.5, 10.0, 13.0, 16.0])
+    legs = (
+        Leg(4.0, 0.0, 150.0, 0),
+        Leg(10.0, 0.0, None, 1, (1.5, -0.5)),
+        Leg(16.0, 0.1, None, 0),
+    )
+    heading = 0.3
+    state = fly(legs, times_s, (5.0, 6.0), heading).state
+    u = 150.0 * np.array([np.sin(heading), np.cos(heading)])
+    a = np.array([1.5, -0.5])
+    start = np.array([5.0, 6.0]) + 4.0 * u
+    for row, t in zip(state[1:4], (0.0, 3.5, 6.0), strict=True):
+        np.testing.assert_allclose(row[[0, 2]], start + u * t + a * t**2 / 2, rtol=1e-13)
+        np.testing.assert_allclose(row[[1, 3]], u + a * t, rtol=1e-13)
+    speed = np.hypot(*(u + 6.0 * a))
+    np.testing.assert_allclose(np.hypot(state[4:, 1], state[4:, 3]), speed, rtol=1e-13)
+    turned = np.arctan2(state[5, 1], state[5, 3]) - np.arctan2(state[3, 1], state[3, 3])
+    assert turned == pytest.approx(0.6, abs=1e-12)
+
+
 # ---- models of chains ------------------------------------------------------------------------
 
 

@@ -49,6 +49,7 @@ def folder(tmp_path):
         ("published", published),
         ("comparisons", []),
         ("reliability", []),
+        ("delays", []),
     ):
         columns = results.SCHEMAS[name].names
         table = results.pa.table(

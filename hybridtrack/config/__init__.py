@@ -6,11 +6,11 @@ from pathlib import Path
 from hybridtrack.compiled import PACKAGE
 from hybridtrack.config.build import build
 from hybridtrack.config.checks import nearest
-from hybridtrack.config.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.config.reader import Document, ScenarioError, read
 from hybridtrack.config.schema import json_schema
 from hybridtrack.config.validate import validate
 from hybridtrack.config.writer import dump
+from hybridtrack.description import ChosenEstimator, Experiment, Initial, Window
 
 __all__ = [
     "ChosenEstimator",
@@ -23,6 +23,7 @@ __all__ = [
     "find",
     "json_schema",
     "load",
+    "nearest",
     "read",
     "shipped",
 ]

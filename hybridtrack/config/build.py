@@ -6,16 +6,17 @@ from typing import Any
 
 import numpy as np
 
+from hybridtrack.analyses import analyses
 from hybridtrack.config import banks, checks, starts, truths
-from hybridtrack.config.claims import built_claim
-from hybridtrack.config.description import ChosenEstimator, Experiment, Initial, Window
+from hybridtrack.config.claims import analysis_claim, built_claim
 from hybridtrack.config.reader import Document, Keys, ScenarioError
-from hybridtrack.config.schema import Form, ScenarioForm, WindowForm
+from hybridtrack.config.schema import ScenarioForm, WindowForm
+from hybridtrack.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.errors import UserError
 from hybridtrack.estimators import estimators
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.simulation import Case, FixedTruth
-from hybridtrack.verdicts import Claim
+from hybridtrack.verdicts import AnalysisClaim, Claim
 
 
 def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
@@ -52,7 +53,13 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
     sensor = truths.sensor(form, truth_modes, cases, initial.two_point, document)
     claims = tuple(
         built_claim(i, form, chosen, truth_modes, cases, sensor, document)
-        for i in range(len(form.published))
+        for i, claim in enumerate(form.published)
+        if claim.analysis is None
+    )
+    analysis_claims = tuple(
+        analysis_claim(i, form, document)
+        for i, claim in enumerate(form.published)
+        if claim.analysis is not None
     )
     return Experiment(
         name=form.name,
@@ -72,7 +79,12 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         seed=form.monte_carlo.seed,
         keep_tracks=min(form.monte_carlo.keep_tracks, form.monte_carlo.runs),
         claims=claims,
-        resolved=_resolved(form, claims, folder),
+        analysis_claims=analysis_claims,
+        analyses={
+            name: one.settings(**dict(getattr(form.analyses, name)))
+            for name, one in analyses().items()
+        },
+        resolved=_resolved(form, (claims, analysis_claims), folder),
     )
 
 
@@ -210,11 +222,25 @@ def _check_span(name: str, window: WindowForm, cases: tuple[Case, ...], document
         )
 
 
-def _resolved(form: Form, claims: tuple[Claim, ...], folder: Path) -> dict[str, Any]:
+def _resolved(
+    form: ScenarioForm,
+    claims: tuple[tuple[Claim, ...], tuple[AnalysisClaim, ...]],
+    folder: Path,
+) -> dict[str, Any]:
     data = form.model_dump(by_alias=True, exclude_none=True)
-    for written, claim in zip(data["published"], claims, strict=True):
-        if claim.value is not None and (claim.sign is None or claim.compare is not None):
-            written["tolerance"] = claim.tolerance
+    data["analyses"] = form.analyses.model_dump(exclude_defaults=True)
+    of_runs, of_analyses = iter(claims[0]), iter(claims[1])
+    for written in data["published"]:
+        if "analysis" in written:
+            figure = next(of_analyses)
+            judged = figure.value is not None and figure.sign is None
+            tolerance = figure.tolerance
+        else:
+            claim = next(of_runs)
+            judged = claim.value is not None and (claim.sign is None or claim.compare is not None)
+            tolerance = claim.tolerance
+        if judged:
+            written["tolerance"] = tolerance
     recording = data["truth"].get("recording", {})
     for holder in (recording, recording.get("reference", {})):
         if "file" in holder and "package" not in holder:

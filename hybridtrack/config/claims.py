@@ -3,14 +3,53 @@
 from collections.abc import Iterator
 
 from hybridtrack.config import checks
-from hybridtrack.config.description import ChosenEstimator
 from hybridtrack.config.exact import exact_figure
 from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import ClaimForm, ScenarioForm
+from hybridtrack.description import ChosenEstimator
 from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case
 from hybridtrack.statistics import METRICS
-from hybridtrack.verdicts import Claim, printed_tolerance
+from hybridtrack.verdicts import AnalysisClaim, Claim, printed_tolerance
+
+
+def analysis_claim(i: int, form: ScenarioForm, document: Document) -> AnalysisClaim:
+    """The i-th claim, on a figure of an analysis."""
+    claim = form.published[i]
+    path: Keys = ("published", i)
+    assert claim.analysis is not None
+    if claim.figure is None:
+        raise document.error(
+            path, "'figure' is missing in this claim: the column of the analysis' table; add it"
+        )
+    for key in ("estimator", "compare", "metric", "mode"):
+        if getattr(claim, key) is not None:
+            raise document.error(
+                (*path, key), f"'{key}' is a run's, and this claim is on an analysis; see 'where'"
+            )
+    if claim.window != "all":
+        raise document.error((*path, "window"), "'window' is a run's; remove it")
+    if claim.than is None and (claim.value is None or claim.sign == "equal"):
+        raise document.error(path, "'value' is missing in this claim on one figure; add it")
+    if claim.than is not None and (
+        claim.sign not in ("less", "greater") or claim.value is not None
+    ):
+        raise document.error(
+            path, "a comparison with 'than' needs 'sign', less or greater, and no 'value'"
+        )
+    return AnalysisClaim(
+        claim=claim.claim,
+        analysis=claim.analysis,
+        figure=claim.figure,
+        where=claim.where or {},
+        than=claim.than,
+        value=claim.value,
+        tolerance=_tolerance(claim, document, path),
+        sign=claim.sign,
+        expect=claim.expect,
+        because=claim.because,
+        place=str(document.error((*path, "figure"), "").args[0]).rstrip(": "),
+    )
 
 
 def built_claim(
@@ -30,6 +69,12 @@ def built_claim(
     if len(given) != 1:
         raise document.error(path, "a claim needs one of 'estimator', 'compare' and 'figure'")
     exact = None
+    for key in ("where", "than"):
+        if getattr(claim, key) is not None:
+            raise document.error(
+                (*path, key),
+                f"'{key}' is a row of an analysis' table; add 'analysis', or remove it",
+            )
     if claim.figure is not None:
         _check_exact(claim, document, path)
         exact = exact_figure(claim, cases, sensor, document, path)
@@ -160,7 +205,7 @@ def _of_modes(one: ChosenEstimator, truth: bool) -> Iterator[str]:
 
 def _tolerance(claim: ClaimForm, document: Document, path: Keys) -> float:
     """As given, else half a unit of the last digit that is printed; a bound has none."""
-    bound = claim.estimator is not None and claim.sign is not None
+    bound = claim.compare is None and claim.sign is not None
     if claim.tolerance is not None or claim.value is None or bound:
         return claim.tolerance or 0.0
     try:

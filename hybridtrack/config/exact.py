@@ -15,6 +15,13 @@ from hybridtrack.models import ModeBank
 from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case, step_lengths
 
+# What `published` may hold against a scenario's chain or modes, without a run and an analysis.
+EXACT_FIGURES = (
+    "expected_steps_to_end",
+    "expected_steps_in_mode",
+    "expected_transitions",
+    "manoeuvring_index",
+)
 OF_MODES = ("expected_steps_in_mode", "manoeuvring_index")
 
 
@@ -23,6 +30,12 @@ def exact_figure(
 ) -> float:
     """The value of a claim's `figure`: of the truth's chain, or of one of its modes."""
     name, truth = claim.figure, cases[0].truth
+    if name not in EXACT_FIGURES:
+        raise document.error(
+            (*path, "figure"),
+            f"'figure' is {name}, which needs an 'analysis', or is none; "
+            f"{checks.nearest(str(name), EXACT_FIGURES)}",
+        )
     if not isinstance(truth, ChainTruth):
         raise document.error(
             (*path, "figure"), f"'{name}' is a chain's, and the truth has none; remove the claim"

@@ -16,6 +16,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, create_model
 from pydantic_core import PydanticCustomError
 
+from hybridtrack.analyses import analyses
 from hybridtrack.config import units
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
@@ -24,10 +25,6 @@ from hybridtrack.statistics import METRICS
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
-# What `published` may hold against a scenario's chain or modes without a run; see exact.
-ExactFigure = Literal[
-    "expected_steps_to_end", "expected_steps_in_mode", "expected_transitions", "manoeuvring_index"
-]
 Matrix = list[list[float]]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 PerAxis = list[NonNegative]
@@ -83,11 +80,15 @@ class StartForm(Form):
 
 
 class LegForm(Form):
-    """A straight flight or a coordinated turn; positive turn rates turn right."""
+    """A straight flight, a coordinated turn (positive rates turn right), an acceleration.
+
+    The acceleration is constant, to the east and to the north.
+    """
 
     from_s: float | None = None
     until_s: float
     turn_rate_rad_s: float = 0.0
+    acceleration_m_s2: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
     speed_m_s: NonNegative | None = None
     mode: str | None = None
 
@@ -145,14 +146,13 @@ def _motion_form(name: str) -> type[Form]:
     return create_model(f"mode_{name}", __base__=ModeForm, __doc__=model.summary, **fields)
 
 
-def _estimator_form(name: str) -> type[Form]:
-    estimator = estimators()[name]
-    defaults = estimator.settings._field_defaults
-    fields: dict[str, Any] = {"type": (Literal[name], ...)}
-    for setting, annotation in typing.get_type_hints(estimator.settings).items():
-        limits = estimator.limits.get(setting)
+def _settings_form(kind: str, one: Any, **fields: Any) -> type[Form]:
+    """The form of an estimator's or an analysis' settings, besides some fields more."""
+    defaults = one.settings._field_defaults
+    for setting, annotation in typing.get_type_hints(one.settings).items():
+        limits = one.limits.get(setting)
         fields[setting] = (_annotation(annotation, limits), defaults.get(setting, ...))
-    return create_model(f"estimator_{name}", __base__=Form, __doc__=estimator.summary, **fields)
+    return create_model(f"{kind}_{one.name}", __base__=Form, __doc__=one.summary, **fields)
 
 
 def _tagged(forms: dict[str, type[Form]], key: str, otherwise: str) -> Any:
@@ -165,12 +165,26 @@ def _tagged(forms: dict[str, type[Form]], key: str, otherwise: str) -> Any:
 
 
 MOTION_FORMS = {name: _motion_form(name) for name in MOTION_MODELS} | {"matrices": MatricesForm}
-ESTIMATOR_FORMS = {name: _estimator_form(name) for name in estimators()}
+ESTIMATOR_FORMS = {
+    name: _settings_form("estimator", estimator, type=(Literal[name], ...))
+    for name, estimator in estimators().items()
+}
+ANALYSIS_FORMS = {name: _settings_form("analysis", one) for name, one in analyses().items()}
+ANALYSES = tuple(analyses())
 
 if TYPE_CHECKING:  # which form it is, the scenario decides
     ModeUnion: TypeAlias = Any
     EstimatorUnion: TypeAlias = Any
+    AnalysisName: TypeAlias = str
+    AnalysesForm: TypeAlias = Any
 else:
+    AnalysisName = Literal[ANALYSES]
+    AnalysesForm = create_model(
+        "analyses",
+        __base__=Form,
+        __doc__="Settings of `hybridtrack analyze`, by analysis.",
+        **{name: (form, form()) for name, form in ANALYSIS_FORMS.items()},
+    )
     ModeUnion = _tagged(MOTION_FORMS, "motion", "matrices")
     EstimatorUnion = _tagged(ESTIMATOR_FORMS, "type", "")
 
@@ -277,12 +291,22 @@ class MonteCarloForm(Form):
     keep_tracks: Annotated[int, Field(ge=0, le=256)] = 1
 
 
+Cells = dict[str, str | int | float | bool]  # which row of an analysis' table: its cells
+
+
 class ClaimForm(Form):
-    """A published claim: a figure of one estimator, a comparison of two, or an exact figure."""
+    """A published claim: a figure of one estimator, a comparison of two, or an exact figure.
+
+    With `analysis` it is about a figure (a column) of that analysis' table, in the row that `where`
+    tells; with `than` it compares that with another row's.
+    """
 
     claim: str
     metric: Annotated[str | None, Field(json_schema_extra={"enum": [*METRICS, None]})] = None
-    figure: ExactFigure | None = None
+    figure: str | None = None
+    analysis: AnalysisName | None = None
+    where: Cells | None = None
+    than: Cells | None = None
     mode: str | None = None
     estimator: str | None = None
     compare: Annotated[list[str], Field(min_length=2, max_length=2)] | None = None
@@ -326,6 +350,7 @@ class ScenarioForm(Form):
     compare_with: str | None = None
     windows: dict[Name, WindowForm] = {}
     scoring: ScoringForm = ScoringForm()
+    analyses: AnalysesForm = Field(default={}, validate_default=True)
     monte_carlo: MonteCarloForm
     published: list[ClaimForm] = []
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from hybridtrack.config import checks
-from hybridtrack.config.description import Initial
 from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import InitialForm
+from hybridtrack.description import Initial
 from hybridtrack.models import ModeBank
 
 # By what a state's name is before its axis.

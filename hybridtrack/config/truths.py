@@ -166,7 +166,7 @@ def _legs(
     if form.dimensions != 2:
         raise document.error(("dimensions",), "'dimensions' is 1 and legs need 2; remove it")
     legs: list[Leg] = []
-    speed, end = truth.start.speed_m_s, float(times_s[0])
+    end = float(times_s[0])
     for i, leg in enumerate(truth.legs):
         path: Keys = ("truth", "legs", i)
         begin = end if leg.from_s is None else leg.from_s
@@ -183,8 +183,16 @@ def _legs(
             )
         mode = modes[0] if leg.mode is None else leg.mode
         checks.known_mode(mode, modes, document, (*path, "mode"), tuple(form.modes))
-        speed = speed if leg.speed_m_s is None else leg.speed_m_s
-        legs.append(Leg(leg.until_s, leg.turn_rate_rad_s, speed, modes.index(mode)))
+        speed = truth.start.speed_m_s if i == 0 and leg.speed_m_s is None else leg.speed_m_s
+        east, north = leg.acceleration_m_s2 or (0.0, 0.0)
+        acceleration = (east, north)
+        if leg.turn_rate_rad_s and any(acceleration):
+            raise document.error(
+                as_written(document, (*path, "acceleration_m_s2")),
+                "a leg is a turn or has an acceleration, and this has both; remove one of them",
+            )
+        number = modes.index(mode)
+        legs.append(Leg(leg.until_s, leg.turn_rate_rad_s, speed, number, acceleration))
         end = leg.until_s
     if times_s[-1] - end > 1e-6 * np.diff(times_s).min():
         raise document.error(

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from hybridtrack import results
+from hybridtrack import dossiers, results
 from hybridtrack.tables import claimed, obtained
 
 HEADER = (
@@ -12,11 +13,14 @@ HEADER = (
 
 
 def markdown(folders: Sequence[Path]) -> str:
-    """A Markdown table over finished run folders. Raises UserError where one isn't."""
+    """A Markdown table over folders of finished runs and analyses.
+
+    Raises UserError where one isn't.
+    """
     lines = [HEADER]
     for folder in folders:
-        name = results.require_complete(folder)["name"]
-        for row in results.read_rows(folder, "published"):
+        name, rows = _published(folder)
+        for row in rows:
             because = f": {row['because']}" if row["because"] else ""
             cells = (
                 name,
@@ -27,3 +31,11 @@ def markdown(folders: Sequence[Path]) -> str:
             )
             lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |\n")
     return "".join(lines)
+
+
+def _published(folder: Path) -> tuple[str, list[dict[str, Any]]]:
+    """The scenario, and what became of its claims."""
+    record = dossiers.read(folder)
+    if record is not None:
+        return record["scenario"], record["published"]
+    return results.require_complete(folder)["name"], results.read_rows(folder, "published")

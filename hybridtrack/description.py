@@ -1,5 +1,6 @@
 """What a scenario asks for, in SI and arrays: the frozen Experiment and its parts."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,8 +8,8 @@ import numpy as np
 from hybridtrack.estimators import Estimator
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.sensors import Sensor
-from hybridtrack.simulation import Case, step_lengths
-from hybridtrack.verdicts import Claim
+from hybridtrack.simulation import Case, sojourns, step_lengths
+from hybridtrack.verdicts import AnalysisClaim, Claim
 
 
 class Initial(NamedTuple):
@@ -61,8 +62,15 @@ class Experiment(NamedTuple):
     runs: int
     seed: int
     keep_tracks: int
-    claims: tuple[Claim, ...]
+    claims: tuple[Claim, ...]  # on figures of a run
+    analysis_claims: tuple[AnalysisClaim, ...]
+    analyses: Mapping[str, Any]  # settings by analysis
     resolved: dict[str, Any]  # the scenario as it can be run again
+
+    def switches(self, case: int) -> bool:
+        """Whether the truth of a case may change its mode."""
+        lasting = sojourns(self.cases[case].truth)
+        return len(self.truth_modes) > 1 and (lasting is None or len(lasting) > 1)
 
     @property
     def foresees(self) -> bool:
