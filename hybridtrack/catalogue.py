@@ -4,7 +4,7 @@ from hybridtrack.analyses import analyses
 from hybridtrack.config import shipped
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
-from hybridtrack.statistics import CALIBRATION, METRICS
+from hybridtrack.statistics import CALIBRATION, FALSE_SWITCHES, METRICS
 
 
 def catalogue() -> dict[str, dict[str, str]]:
@@ -14,7 +14,10 @@ def catalogue() -> dict[str, dict[str, str]]:
         "motions": {name: m.summary.rstrip(".") for name, m in MOTION_MODELS.items()},
         "analyses": {name: one.summary for name, one in analyses().items()},
         "metrics": {name: m.summary for name, m in METRICS.items()}
-        | {CALIBRATION: "mean distance of that probability from how often it came true (ECE)"},
+        | {
+            CALIBRATION: "mean distance of that probability from how often it came true (ECE)",
+            FALSE_SWITCHES: "how often the mode estimate leaves the true mode, per stay in it",
+        },
         "scenarios": {name: _title(name) for name in shipped()},
     }
 

@@ -41,11 +41,12 @@ def _draw_panel(ax: Axes, panel: Panel, place: dict[str, int], marks: dict[str, 
         known = band.label in place
         colour = COLOURS[place[band.label] % len(COLOURS)] if known else "0.6"
         label = None if known else plain(band.label, 60)
-        ax.fill_between(band.x, low, high, color=colour, alpha=0.2, linewidth=0, label=label)
+        look: dict[str, Any] = {"color": colour, "alpha": 0.2, "linewidth": 0, "label": label}
+        ax.fill_between(band.x, low, high, step=band.steps or None, **look)
     for line in panel.lines:
         few = len(line.x) <= 60
         if line.reference:
-            look: dict[str, Any] = {"color": TRUTH_COLOUR, "linewidth": 0.8}
+            look = {"color": TRUTH_COLOUR, "linewidth": 0.8}
         else:
             i = place[line.label]
             look = {"color": COLOURS[i % len(COLOURS)], "linewidth": 1.3}

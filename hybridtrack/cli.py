@@ -114,15 +114,24 @@ def init(
     say(f"now: hybridtrack run {path}")
 
 
-@command("hybridtrack validate configs/rmimm_fig5.yaml", "hybridtrack validate configs/*.yaml")
+@command(
+    "hybridtrack validate configs/rmimm_fig5.yaml",
+    "hybridtrack validate configs/*.yaml",
+    "hybridtrack validate --theory my_scenario.yaml",
+)
 def validate(
     config: Annotated[list[str], typer.Argument(help="Scenarios' files, or shipped ones' names.")],
+    theory: Annotated[
+        bool, typer.Option("--theory", help="Say what is too short for the filters, too.")
+    ] = False,
 ) -> None:
     """Check scenarios without running them.
 
-    Exits with 2 if one has a mistake.
+    Exits with 2 if one has a mistake. --theory compares how long each mode lasts with how many
+    scans it takes to notice it and to tell it from the others; what it finds is no mistake.
     """
     from hybridtrack import config as scenarios
+    from hybridtrack.analyses import lint
     from hybridtrack.tables import counted
 
     mistakes = 0
@@ -139,6 +148,8 @@ def validate(
             f"{counted(experiment.runs, 'run')}, "
             f"{counted(len(experiment.estimators), 'estimator')})"
         )
+        for sentence in lint(experiment) if theory else ():
+            print(f"  {sentence}")
     if mistakes:
         raise typer.Exit(2)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from hybridtrack.console import command, say
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Unsuited, UserError
 from hybridtrack.options import (
     Detect,
     Json,
@@ -151,7 +151,7 @@ def analyze(
     """
     from hybridtrack import tables
     from hybridtrack.analyses import analyses
-    from hybridtrack.config import nearest
+    from hybridtrack.config import located, nearest
     from hybridtrack.studies import analysis as studies
 
     known = analyses()
@@ -170,22 +170,25 @@ def analyze(
                 "it out"
             )
         settings.append(f"analyses.{analysis}.as_printed=true")
-    experiment = load_scenario(config, settings, runs, seed)
-    if chosen.wants_run is not None:
-        wanted = chosen.wants_run(experiment)
-        if wanted:
-            experiment = load_scenario(config, [*settings, *wanted], runs, seed)
-    folder = out if out is not None else studies.default_folder(experiment, chosen)
-    if force:
-        studies.forget(folder)
-    record = studies.finished(experiment, chosen, folder)
-    if record is None:
-        run = None
+    try:
+        experiment = load_scenario(config, settings, runs, seed)
         if chosen.wants_run is not None:
-            run = exact_run(experiment, workers, quiet)
-        record = studies.analyse(experiment, chosen, folder, run)
-    elif not quiet:
-        say(f"complete already: {folder} is shown, not repeated (--force repeats it)")
+            wanted = chosen.wants_run(experiment)
+            if wanted:
+                experiment = load_scenario(config, [*settings, *wanted], runs, seed)
+        folder = out if out is not None else studies.default_folder(experiment, chosen)
+        if force:
+            studies.forget(folder)
+        record = studies.finished(experiment, chosen, folder)
+        if record is None:
+            run = None
+            if chosen.wants_run is not None:
+                run = exact_run(experiment, workers, quiet)
+            record = studies.analyse(experiment, chosen, folder, run)
+        elif not quiet:
+            say(f"complete already: {folder} is shown, not repeated (--force repeats it)")
+    except Unsuited as error:
+        raise located(config, settings, error.keys, str(error)) from None
     for sentence in tables.surprises_of(record):
         say(f"warning: {sentence}")
     if json:

@@ -17,10 +17,12 @@ from hybridtrack.compiled import lane_kernel
 from hybridtrack.models import Array
 from hybridtrack.statistics import Moments, SumMoments, merge_sum_moments, sum_moments
 
+# Of runs that may be in a mode before the switch to it: beyond, the delay is that of no switch.
+MOST_ALREADY = 0.25
 LONGEST = 1000  # steps that a sojourn is followed for: later ones count as not noticed
 
 Integers = NDArray[np.int64]
-LANE, GROUP, DELAY, LASTED, FALSE, ENDED = range(6)  # what is noted of a sojourn
+LANE, GROUP, DELAY, LASTED, FALSE, ENDED, ALREADY = range(7)  # what is noted of a sojourn
 
 
 class Delays(NamedTuple):
@@ -33,7 +35,9 @@ class Delays(NamedTuple):
     detected: Array
     missed: Array
     unfinished: Array
-    false_switches: SumMoments  # over runs: false switches, and sojourns; arrays (n_groups,)
+    already: Array  # (n_groups,) how many began when the estimate was the new mode already
+    # Over runs: false switches, and sojourns; arrays (n_groups + 1,), the last of all together.
+    false_switches: SumMoments
 
 
 def merge_delays(a: Delays, b: Delays) -> Delays:
@@ -42,6 +46,7 @@ def merge_delays(a: Delays, b: Delays) -> Delays:
         a.detected + b.detected,
         a.missed + b.missed,
         a.unfinished + b.unfinished,
+        a.already + b.already,
         merge_sum_moments(a.false_switches, b.false_switches),
     )
 
@@ -55,6 +60,8 @@ class _Watch(NamedTuple):
     delay: Integers  # 0: not noticed yet
     right: Integers  # whether the estimate was, a step ago
     false_switches: Integers
+    estimate: Integers  # a step ago; -1: none
+    already: Integers  # whether the estimate was the new mode before its sojourn began
 
 
 @lane_kernel
@@ -63,7 +70,7 @@ def _follow(watch, probabilities, true_mode, table, numbered, step, runs, counts
 
     probabilities (n_steps, n_modes, lanes); true_mode (n_steps, lanes or 1); table: the estimator's
     number of each of the truth's modes; counts (n_modes, n_steps of the case): runs that estimate
-    each mode; events (capacity, 6).
+    each mode; events (capacity, 7).
     """
     n_modes, lanes = probabilities.shape[1], probabilities.shape[2]
     n_true = table.size
@@ -87,6 +94,7 @@ def _follow(watch, probabilities, true_mode, table, numbered, step, runs, counts
                     events[noted, 3] = now - watch.begun[b]
                     events[noted, 4] = watch.false_switches[b]
                     events[noted, 5] = 1
+                    events[noted, 6] = watch.already[b]
                     noted += 1
                 if numbered:
                     watch.group[b] += 1
@@ -99,12 +107,15 @@ def _follow(watch, probabilities, true_mode, table, numbered, step, runs, counts
                 watch.delay[b] = 0
                 watch.right[b] = 0
                 watch.false_switches[b] = 0
+                known = before >= 0 and mode >= 0 and watch.estimate[b] >= 0
+                watch.already[b] = 1 if known and table[mode] == watch.estimate[b] else 0
             right = 1 if mode >= 0 and table[mode] == best and best >= 0 else 0
             if right == 1 and watch.delay[b] == 0:
                 watch.delay[b] = now - watch.begun[b] + 1
             if right == 0 and watch.right[b] == 1:
                 watch.false_switches[b] += 1
             watch.right[b] = right
+            watch.estimate[b] = best
     return noted
 
 
@@ -123,10 +134,10 @@ class DelayTally:
         """sojourns: the steps each lasts, where all runs have the same; else None."""
         self._table = np.array([modes.index(m) if m in modes else -1 for m in truth_modes])
         self._modes, self._runs, self._sojourns = modes, runs, sojourns
-        zeros = (np.zeros(lanes, dtype=np.int64) for _ in range(5))
+        zeros = (np.zeros(lanes, dtype=np.int64) for _ in range(7))
         self._watch = _Watch(np.full(lanes, -2), *zeros)
         self._counts = np.zeros((len(modes), n_steps))
-        self._events: Integers = np.zeros((8 * lanes, 6), dtype=np.int64)
+        self._events: Integers = np.zeros((8 * lanes, 7), dtype=np.int64)
         self._noted = 0
         self._steps = 0  # those done
 
@@ -138,7 +149,7 @@ class DelayTally:
         switches = np.count_nonzero(true_mode[1:] != true_mode[:-1]) + true_mode.shape[1]
         needed = self._noted + switches * (lanes // true_mode.shape[1])
         if needed > len(self._events):
-            room = np.zeros((2 * needed, 6), dtype=np.int64)
+            room = np.zeros((2 * needed, 7), dtype=np.int64)
             room[: self._noted] = self._events[: self._noted]
             self._events = room
         self._noted = _follow(
@@ -175,6 +186,7 @@ class DelayTally:
                 self._steps + 1 - watch.begun,
                 watch.false_switches,
                 np.zeros_like(watch.mode),
+                watch.already,
             ],
             axis=1,
         )
@@ -202,9 +214,14 @@ class DelayTally:
             .astype(np.float64)
             for weights in (events[:, FALSE], None)
         )
-        everywhere = np.broadcast_to(sound, (groups, self._runs))
+        false_switches, number = (
+            np.concatenate([part, part.sum(axis=0, keepdims=True)])
+            for part in (false_switches, number)
+        )
+        everywhere = np.broadcast_to(sound, (groups + 1, self._runs))
         moments = sum_moments(false_switches, number, everywhere)
-        return Delays(detected, missed, unfinished, moments)
+        already = np.bincount(events[:, GROUP], weights=events[:, ALREADY], minlength=groups)
+        return Delays(detected, missed, unfinished, already.astype(np.float64), moments)
 
 
 class Distribution(NamedTuple):

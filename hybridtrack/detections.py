@@ -12,7 +12,7 @@ from hybridtrack.config import Experiment
 from hybridtrack.delays import Delays, distribution
 from hybridtrack.models import Array
 from hybridtrack.simulation import Case, sojourns
-from hybridtrack.statistics import ratio_of_sums
+from hybridtrack.statistics import Estimate, ratio_of_sums
 from hybridtrack.verdicts import K
 
 
@@ -30,6 +30,8 @@ class Switch(NamedTuple):
     from_mode: str | None
     to_mode: str
     step: int | None  # the first that the new mode affects
+    stay_steps: int | None  # that the new mode lasts
+    is_last: bool  # ended by the end of the data, not by another switch
     time_s: float | None  # at which the mode changes
 
 
@@ -38,12 +40,20 @@ def switches(case: Case, truth_modes: tuple[str, ...]) -> list[Switch]:
     lasting = sojourns(case.truth)
     if lasting is None:
         pairs = [(a, b) for a in truth_modes for b in truth_modes]
-        return [Switch(None, None if a == b else a, b, None, None) for a, b in pairs]
+        return [Switch(None, None if a == b else a, b, None, None, False, None) for a, b in pairs]
     first = np.concatenate([[0], np.cumsum(lasting)[:-1]]) + 1
     names = [truth_modes[j] for j in case.truth.mode[first]]  # type: ignore[union-attr]
     before = [None, *names[:-1]]
     return [
-        Switch(i, before[i], names[i], int(step), float(case.times_s[step - 1]))
+        Switch(
+            i,
+            before[i],
+            names[i],
+            int(step),
+            int(lasting[i]),
+            i == len(first) - 1,
+            float(case.times_s[step - 1]),
+        )
         for i, step in enumerate(first)
     ]
 
@@ -129,12 +139,15 @@ def _summary(
         *key,
         switch.step,
         switch.time_s,
+        switch.stay_steps,
         int(n),
         *averaged,
+        None if averaged[0] is None else said(averaged[0], switch.stay_steps, switch.is_last),
         int(detected),
         int(missed),
         int(unfinished),
         *_share(float(by[1]), n),
+        *_share(float(delays.already[g]), n),
         mean,
         error,
         float(np.argmax(reached)) + 1.0 if reached.any() else math.inf,
@@ -142,6 +155,19 @@ def _summary(
         wrong.value,
         wrong.standard_error,
     )
+
+
+def said(delay: float, stay_steps: int | None, is_last: bool) -> str:
+    """A delay in words: a stay that the data cut short tells no more than how long it was."""
+    if math.isfinite(delay):
+        return f"{delay:.0f}"
+    return f"over {stay_steps}" if is_last else "never"
+
+
+def false_switches(cases: list[GroupStatistics], label: str) -> Estimate:
+    """How often the estimate leaves the right mode, per stay of the truth."""
+    cells = [group.delays[label].false_switches for group in cases if label in group.delays]
+    return ratio_of_sums([tuple(float(part[-1]) for part in cell) for cell in cells], root=False)
 
 
 def _share(part: float, n: float) -> tuple[float, float]:

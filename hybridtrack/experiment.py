@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridtrack import __version__, outcomes, results
+from hybridtrack.analyses import lint
 from hybridtrack.blocks import (
     BlockTask,
     GroupStatistics,
@@ -126,6 +127,7 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
         folder.write_table("published", outcomes.published_rows(experiment, pairs, merged))
         manifest |= {
             "finished": _now(),
+            "theory": lint(experiment),
             "diverged": {
                 label: count
                 for label in merged[0].diverged
@@ -235,8 +237,8 @@ def _unpack(arrays: dict[str, Any]) -> tuple[GroupStatistics, list[Track]]:
     }
     followed = zip(*(arrays[f"delays_{field}"] for field in Delays._fields), strict=True)
     delays = {
-        label: Delays(detected, missed, unfinished, SumMoments(*false_switches))
-        for label, (detected, missed, unfinished, false_switches) in zip(
+        label: Delays(detected, missed, unfinished, already, SumMoments(*false_switches))
+        for label, (detected, missed, unfinished, already, false_switches) in zip(
             keys["delays"], followed, strict=True
         )
     }

@@ -11,10 +11,12 @@ import pyarrow as pa
 from hybridtrack import columns, results
 from hybridtrack.blocks import RAW, BlockResult, GroupStatistics, Track
 from hybridtrack.config import Experiment
+from hybridtrack.detections import false_switches
 from hybridtrack.errors import UserError
 from hybridtrack.simulation import BLOCK_RUNS
 from hybridtrack.statistics import (
     CALIBRATION,
+    FALSE_SWITCHES,
     METRICS,
     POSITION,
     POSITION_AT_SCANS,
@@ -180,6 +182,10 @@ def summary_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
                 estimate = _pooled(cases, label, window.name, metric)
                 if not math.isnan(estimate.value):
                     rows.append((label, name, window.name, *estimate))
+    for label in cases[0].delays:
+        estimate = false_switches(cases, label)
+        if not math.isnan(estimate.value):
+            rows.append((label, FALSE_SWITCHES, experiment.windows[0].name, *estimate))
     for label, found in _reliabilities(experiment, cases).items():
         if not math.isnan(found.calibration_error.value):
             rows.append((label, CALIBRATION, experiment.windows[0].name, *found.calibration_error))

@@ -75,6 +75,9 @@ METRICS: Mapping[str, Metric] = {
 # A figure of a whole window, not a mean over its runs and steps; see reliability.
 CALIBRATION = "final_mode_calibration_error"
 
+# Of a whole run too: how often an estimate leaves the right mode while the truth stays in it.
+FALSE_SWITCHES = "false_switches_per_stay"
+
 # The position error at the scans that were not missed: what compares with the measurements.
 POSITION, POSITION_AT_SCANS = "position_squared_error_m2", "position_squared_error_at_scans_m2"
 VELOCITY = "velocity_squared_error_m2_s2"

@@ -12,6 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from hybridtrack import results
+from hybridtrack.delays import MOST_ALREADY
+from hybridtrack.statistics import FALSE_SWITCHES
 
 # Metric, heading: what the main table shows, where the scenario has it.
 ERRORS = {
@@ -34,6 +36,7 @@ MOST_DECIMALS = 6  # more than that, and figures of a million on, take an expone
 MOST_DIGITS = 6  # of a figure with an exponent, after its point
 SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
 WIDEST = 10_000
+MOST_SENTENCES = 4  # of theory
 MOST_SWITCHES = 6  # whose delays are printed
 VERDICT_STYLES = {
     "reproduced": "green",
@@ -144,7 +147,7 @@ def _parts(path: Path) -> Iterator[RenderableType]:
         yield ""
         labels = [label for label in manifest["estimators"] if label in told]
         yield _summary("mode is the last", summary, labels, FINAL_MODE)
-    yield from _delays(results.read_rows(path, "delays"))
+    yield from _delays(results.read_rows(path, "delays"), summary)
     for label, count in manifest.get("diverged", {}).items():
         yield Text(
             f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
@@ -154,10 +157,20 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     ]
     if windows:
         yield Text(f"windows {', '.join(windows)}: see summary.csv")
+    yield from _theory(manifest.get("theory", []))
     published = results.read_rows(path, "published")
     if published:
         yield ""
         yield _published(published)
+
+
+def _theory(sentences: list[str]) -> Iterator[RenderableType]:
+    """What theory finds too short in the truth."""
+    if sentences:
+        yield "\ntoo short by theory (hybridtrack analyze observability):"
+        yield from (_hanging(sentence) for sentence in sentences[:MOST_SENTENCES])
+        if len(sentences) > MOST_SENTENCES:
+            yield f"and {len(sentences) - MOST_SENTENCES} more: hybridtrack validate --theory"
 
 
 def _width(table: Table, console: Console) -> int:
@@ -174,7 +187,7 @@ def _plain_table() -> Table:
     return Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1), show_edge=False)
 
 
-def _delays(rows: Rows) -> Iterator[RenderableType]:
+def _delays(rows: Rows, summary: Rows) -> Iterator[RenderableType]:
     """Steps until switches are noticed, a column for each; the start is none."""
     keys = ("case", "switch", "from_mode", "to_mode")
     found = [row for row in rows if row["from_mode"] is not None]
@@ -182,7 +195,8 @@ def _delays(rows: Rows) -> Iterator[RenderableType]:
     if not switches:
         return
     yield ""
-    if len(switches) > MOST_SWITCHES or len({switch[0] for switch in switches}) > 1:
+    several = len({switch[0] for switch in switches}) > 1
+    if len(switches) > MOST_SWITCHES or several:
         yield Text(f"delays of {len(switches):,} switches: see delays.parquet")
         return
     table = _plain_table()
@@ -191,18 +205,36 @@ def _delays(rows: Rows) -> Iterator[RenderableType]:
         time_s = next(row["time_s"] for row in found if row["switch"] == switch[1])
         when = "" if time_s is None else f"\n{time_s:g} s"
         table.add_column(Text(f"{switch[2]}\nto {switch[3]}{when}"), justify="right", no_wrap=True)
+    table.add_column(Text("false\nper stay"), justify="right", no_wrap=True)
     cells = {(row["estimator"], *(row[key] for key in keys)): delay(row) for row in found}
+    false = {
+        row["estimator"]: estimate(row["value"], row["standard_error"])
+        for row in summary
+        if row["metric"] == FALSE_SWITCHES
+    }
     for label in dict.fromkeys(row["estimator"] for row in found):
-        table.add_row(Text(label), *(cells.get((label, *switch), "") for switch in switches))
+        own = (cells.get((label, *switch), "") for switch in switches)
+        table.add_row(Text(label), *own, false.get(label, ""))
     yield table
+    if any("*" in cell for cell in cells.values()):
+        yield Text(
+            f"*: in over {MOST_ALREADY:.0%} of the runs the estimate was so before the switch"
+        )
 
 
 def delay(row: Mapping[str, Any]) -> str:
-    """Of the run-averaged mode estimate; of the runs noticed, where each has its own switches."""
-    averaged = row["averaged_delay_steps"]
-    if averaged is None:
-        return figure(row["detection_delay_steps"], row["detection_delay_steps_standard_error"])
-    return "never" if math.isinf(averaged) else f"{averaged:.0f}"
+    """Of the run-averaged mode estimate; the median where every run has its own switches.
+
+    With the share of switches that are missed, and a star where the estimate had been the new
+    mode already.
+    """
+    if row["averaged_delay"] is not None:
+        text = str(row["averaged_delay"])
+    else:
+        median = row["median_delay_steps"]
+        text = "never" if math.isinf(median) else f"{median:.0f}"
+        text += f", {row['missed_share']:.0%} missed" if row["missed_share"] >= 0.005 else ""
+    return text + "*" * bool(row["already_share"] > MOST_ALREADY)
 
 
 Columns = tuple[tuple[str, str], ...]  # metrics and their headings
@@ -311,6 +343,7 @@ def as_json(path: Path) -> dict[str, Any]:
         "runs": manifest["runs"],
         "seed": manifest["seed"],
         "diverged": manifest.get("diverged", {}),
+        "theory": manifest.get("theory", []),
         **tables,
         "figures": [str(figure) for figure in sorted((path / "figures").glob("*.png"))],
     }

@@ -8,6 +8,7 @@ import pytest
 import reference
 from hybridtrack import config
 from hybridtrack.analyses import analyses, model_at_one_step
+from hybridtrack.analyses._directions import condition_15
 from hybridtrack.analyses._mean_course import (
     Switch,
     courses,
@@ -18,7 +19,7 @@ from hybridtrack.analyses._mean_course import (
     start,
     states_of_bank,
 )
-from hybridtrack.analyses._propositions import bounds, rival
+from hybridtrack.analyses._propositions import Ingredients, bounds, rival
 from hybridtrack.analyses._steady_filters import (
     NoSteadyState,
     SteadyFilter,
@@ -26,9 +27,10 @@ from hybridtrack.analyses._steady_filters import (
     steady_filters,
     steady_residual,
 )
-from hybridtrack.analyses.delay import concordance
+from hybridtrack.analyses._tuning import concordance
+from hybridtrack.analyses.delay import _terms
 from hybridtrack.delays import distribution
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Unsuited
 from models import figure_5_model, random_model
 
 ROUNDING = 1e-9  # relative, of a Riccati equation that was solved or iterated
@@ -131,6 +133,14 @@ def test_figure_4s_residuals_settle_and_growing_estimates_do_not(figure_4):
     assert np.linalg.norm(lagging.settled) > 1.0
     grows = second._replace(A=1.01 * second.A)
     assert "grows" in steady_residual(first, grows, turning).reason
+    angle = 0.1
+    turn = first.A.copy()
+    turn[np.ix_([1, 4], [1, 4])] = [
+        [math.cos(angle), math.sin(angle)],
+        [-math.sin(angle), math.cos(angle)],
+    ]
+    circles = first._replace(A=turn)
+    assert "keeps moving" in steady_residual(first, circles, turning).reason
 
 
 def test_equal_modes_have_no_residual(figure_4):
@@ -289,6 +299,123 @@ def test_condition_2_is_that_the_bank_is_right(figure_4, label):
         assert not (sufficient & ~one.holds["proposition_4_1"]).any()
 
 
+def by_hand(model, filters, slow, truth, switch, as_printed):
+    """Every condition for two modes of one state and one output, in plain numbers."""
+    i, T = (one for one in filters)
+    a_T, a_i, b_T, b_i = (float(v) for v in (T.A[0, 0], i.A[0, 0], T.b[0], i.b[0]))
+    c_T, c_i = float(T.C[0, 0]), float(i.C[0, 0])
+    k_T, k_i = float(T.gain[0, 0]), float(i.gain[0, 0])
+    S_T, S_i = float(T.innovation_covariance[0, 0]), float(i.innovation_covariance[0, 0])
+    p = model.transition_matrix[0]
+    f_T, f_i = (1 - k_T * c_T) * a_T, (1 - k_i * c_T) * a_T
+    dA, dC, db = a_T - a_i, c_T - c_i, b_T - b_i
+    h_x, h_u = c_T * dA + dC * a_T - dC * dA, c_T * db + dC * b_T - dC * db
+    g_x = (1 - k_i * c_T) * dA - k_i * dC * a_i
+    g_u = (1 - k_i * c_T) * db - k_i * dC * b_i
+    least_L = math.sqrt((c_T * a_T) ** 2 + h_x**2 + h_u**2)
+    least_FG = math.sqrt(f_i**2 + g_x**2 + g_u**2)
+    ln_S = (2 if as_printed else 1) * math.log(S_i / S_T)
+    alpha, k = S_T / S_i, switch.step - 1
+    e_T, e_i = (truth[k, 0] - slow[k][1][j, 0] for j in (1, 0))
+    before_T, before_i = (truth[k - 1, 0] - slow[k - 1][1][j, 0] for j in (1, 0))
+    found = {name: [] for name in ("1", "1c3", "2c1", "2a", "2c2", "3", "4")}
+    ratio = p[1, 0] / p[0, 0] if as_printed else p[0, 1] / p[0, 0]
+    right = alpha * (least_L * least_FG * before_i) ** 2 if as_printed else 0.0
+    left = (c_T * a_T * (before_T if as_printed else e_T)) ** 2
+    found["4"].append(right + S_T * (ln_S + 2 * math.log(ratio)) > left)
+    first = None
+    for d in range(1, switch.last - switch.step + 2):
+        r, _, c, _ = slow[k + d - 1]
+        ln_mu = 2 * math.log(c[1] / c[0])
+        first = ln_mu if first is None else first
+        rest = r[0, 0] ** 2 / S_i + ln_S + ln_mu
+        left = (c_T * a_T * f_T ** (d - 1) * e_T) ** 2
+        right = alpha * (least_L * least_FG ** (d - 1) * e_i) ** 2 if as_printed else 0.0
+        found["1"].append(rest > 0 and r[1, 0] ** 2 / S_T < rest)
+        found["1c3"].append(rest > 0 and r[1, 0] ** 2 < alpha * r[0, 0] ** 2 + S_T * (ln_S + ln_mu))
+        found["2c1"].append(rest > 0 and left < S_T * (ln_S + first) + right)
+        found["2a"].append(rest > 0 and left < S_T * (ln_S + ln_mu) + right)
+        found["3"].append(left < right + S_T * (ln_S + 2 * math.log(p[0, 1] / p[0, 0])))
+        bound = 1 + (-math.log(alpha) + 2 * math.log(abs(e_T / e_i))) / (
+            2 * math.log(abs(f_i / f_T))
+        )
+        b = r[0, 0] - c_T * a_T * f_i ** (d - 1) * e_i
+        j_not_negative = alpha * b**2 + S_T * (ln_S + first) >= 0
+        found["2c2"].append(as_printed and rest > 0 and d > bound and j_not_negative)
+    return found
+
+
+@pytest.mark.parametrize("as_printed", [False, True])
+def test_every_condition_in_plain_numbers(as_printed):
+    """Random modes of one state, each with its own A, b, C, Q, R; an asymmetric chain."""
+    names = {
+        "1": "proposition_4_1",
+        "1c3": "proposition_4_1_condition_3",
+        "2c1": "proposition_4_2_condition_1",
+        "2a": "proposition_4_2_condition_1_along",
+        "2c2": "proposition_4_2_condition_2",
+        "3": "proposition_4_3",
+        "4": "proposition_4_4",
+    }
+    seen = {name: set() for name in names}
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        model = random_model(rng, n_modes=2, n_x=1, n_y=1)
+        model = model._replace(
+            state_transition=rng.uniform(0.3, 1.0, size=(1, 2, 1, 1)),
+            measurement_noise_covariance=rng.uniform(0.05, 4.0, size=(2, 1, 1)),
+            transition_matrix=np.array([[[0.55, 0.45], [0.2, 0.8]]]),
+            initial_mode_probabilities=np.array([0.7, 0.3]),
+        )
+        i, T = steady(model)
+        mode = np.array([0] * 6 + [1] * 8)
+        truth = rng.normal(size=(15, 1))
+        for k in range(14):
+            one = (i, T)[mode[k]]
+            truth[k + 1] = one.A @ truth[k] + one.b
+        z = np.array([(i, T)[mode[k]].C @ truth[k + 1] for k in range(14)])
+        start = truth[0] + rng.normal(size=1)
+        switch = Switch(1, "m0", "m1", 7, 14, 6.0)
+        bank = run_mean_bank([i, T], model, z, start, True)
+        slow = slow_mean_bank([i, T], model, z, start, True)
+        transition = model.transition_matrix[0]
+        found = rival(bank, switch, [i, T], 1, 0, truth, transition, as_printed)
+        expected = by_hand(model, [i, T], slow, truth, switch, as_printed)
+        for short, name in names.items():
+            np.testing.assert_array_equal(found.holds[name], expected[short], err_msg=name)
+            seen[short] |= set(expected[short])
+    for short in names:
+        if as_printed or short != "2c2":
+            assert seen[short] == {False, True}, short
+
+
+def test_premises_that_fail_are_said(figure_4):
+    swapping = figure_4.bank._replace(transition_matrix=np.array([[0.2, 0.8], [0.7, 0.3]]))
+    for _, found, _ in rivals(figure_4._replace(bank=swapping), "IMM"):
+        for name in ("proposition_4_3", "proposition_4_4"):
+            assert "not diagonally dominant" in bounds(found)[name].result
+
+
+def test_condition_15_by_hand(figure_4):
+    CV, CT = steady(model_at_one_step(figure_4)[0])
+    d = difference(CV, CT)
+    largest, ln = d.largest_information, d.log_determinants
+    # 0 < alpha r^2 + (ln |S_i|/|S_T| + 2 ln p_TT/p_Ti) / lambda_max(S_T^-1)
+    edge = math.sqrt(-(ln + 2 * math.log(0.51 / 0.49)) / largest / d.alpha)
+    assert condition_15(d, 1.001 * edge, 0.51, 0.49) is True
+    assert condition_15(d, 0.999 * edge, 0.51, 0.49) is False
+    assert condition_15(d, 0.0, 1.0, 0.0) is True
+    assert condition_15(d, 5.0, 0.0, 1.0) is None
+
+
+def test_the_three_terms_by_hand():
+    """sqrt(1/alpha) = 2, condition number 3, ratio of errors 5: ln 30."""
+    values = dict.fromkeys(Ingredients._fields, 1.0)
+    values |= {"alpha": 0.25, "sigma_max_C_T_A_T": 6.0, "sigma_min_C_T_A_T": 2.0}
+    values |= {"error_T": 10.0, "error_i": 2.0}
+    assert _terms(Ingredients(**values)) == pytest.approx((4.0, 3.0, 5.0, math.log(30.0)))
+
+
 def test_figure_4s_propositions(figure_4):
     """Condition 1 of 4.2, 4.3 and 4.4 are never satisfied, as printed or not."""
     for label in ("IMM", "MMAE"):
@@ -368,27 +495,31 @@ def test_three_modes_have_no_proposition_4_3():
 
 
 def test_concordance():
-    assert concordance([1, 2, 3], [5, 6, 7]) == 1.0
-    assert concordance([1, 2, 3], [7, 6, 5]) == -1.0
-    assert concordance([1, 2, 3, 4], [1, 2, 2, 1]) == 0.0
-    assert concordance([1, 2, 3], [4, 4, 4]) is None
-    assert concordance([1, 2], [1, math.inf]) == 1.0
-    assert concordance([], []) is None
+    one = [("CV", "R")] * 4
+    assert concordance(one[:3], [1, 2, 3], [5, 6, 7]) == 1.0
+    assert concordance(one[:3], [1, 2, 3], [7, 6, 5]) == -1.0
+    assert concordance(one, [1, 2, 3, 4], [1, 2, 2, 1]) == 0.0
+    assert concordance(one[:3], [1, 2, 3], [4, 4, 4]) is None
+    assert concordance(one[:2], [1, 2], [1, math.inf]) == 1.0
+    assert concordance([], [], []) is None
+    two = [("", ""), ("CV", "R"), ("CT", "R")]
+    assert concordance(two, [2, 1, 3], [5, 4, 4]) == 0.0  # each against the untuned alone
 
 
 def test_scenarios_that_have_nothing_to_notice():
     wants = analyses()["delay"].wants_run
     still = config.load("mode_delay_fig4", ["truth.legs=[{until_s: 90}]", "published=[]"])
     for name in (still, config.load("softbound_outlier"), config.load("recorded_flight")):
-        with pytest.raises(UserError, match="the truth has no switch of mode"):
+        with pytest.raises(Unsuited, match="the truth has no switch of mode") as caught:
             wants(name)
+        assert caught.value.keys == ("truth",)
     experiment = config.load("softbound_ex1")
     one = experiment._replace(bank=experiment.bank._replace(modes=experiment.bank.modes[:1]))
-    with pytest.raises(UserError, match="the filters have one mode"):
+    with pytest.raises(Unsuited, match="the filters have one mode"):
         wants(one)
     others = tuple(mode._replace(name=f"other_{mode.name}") for mode in experiment.bank.modes)
     strange = experiment._replace(bank=experiment.bank._replace(modes=others))
-    with pytest.raises(UserError, match="never switches between two of the filters' modes"):
+    with pytest.raises(Unsuited, match="never switches between two of the filters' modes"):
         wants(strange)
 
 

@@ -59,15 +59,20 @@ def test_sojourns_of_random_runs_against_loops(longest):
     sound[5] = False
     _, found = tallied(mode, p, None, sound, longest, runs)
     detected, missed, unfinished = (np.zeros((9, steps + 1)) for _ in range(3))
+    already = np.zeros(9)
     false, number = np.zeros((9, runs)), np.zeros((9, runs))
     for b in range(runs):
         estimate = [
             None if np.isnan(p[k, 0, b]) else int(p[k, :, b].argmax()) for k in range(steps)
         ]
+        ends = 0
         stays = slow_sojourns(mode[:, b].tolist(), estimate)
         for before, to, delay, lasted, wrong, ended in stays:
             g = (to if before is None else before) * 3 + to
+            begin = ends
+            ends += lasted
             if sound[b]:
+                already[g] += begin > 0 and estimate[begin - 1] == to
                 kind = detected if delay else missed if ended else unfinished
                 kind[g, delay or lasted] += 1
                 false[g, b] += wrong
@@ -77,7 +82,10 @@ def test_sojourns_of_random_runs_against_loops(longest):
     np.testing.assert_array_equal(found.detected, detected)
     np.testing.assert_array_equal(found.missed, missed)
     np.testing.assert_array_equal(found.unfinished, unfinished)
+    np.testing.assert_array_equal(found.already, already)
+    assert already.sum() > 50
     kept = sound
+    false, number = (np.vstack([part, part.sum(axis=0)]) for part in (false, number))
     np.testing.assert_allclose(
         found.false_switches.mean_sum, false[:, kept].mean(axis=1), rtol=1e-12
     )
@@ -139,7 +147,7 @@ def test_merging_is_adding_up():
         for some in (slice(0, 32), slice(32, 64))
     ]
     merged = merge_delays(*halves)
-    for one, other in zip(merged[:3], whole[:3], strict=True):
+    for one, other in zip(merged[:4], whole[:4], strict=True):
         np.testing.assert_array_equal(one, other)
     for one, other in zip(merged.false_switches, whole.false_switches, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
@@ -152,7 +160,8 @@ def counted(detected, missed, unfinished=None):
     nothing = np.zeros_like(detected)
     moments = SumMoments(*(np.zeros(1) for _ in range(6)))
     rest = nothing if unfinished is None else unfinished
-    return Delays(*(np.array([a], dtype=float) for a in (detected, missed, rest)), moments)
+    counts = (np.array([a], dtype=float) for a in (detected, missed, rest))
+    return Delays(*counts, np.zeros(1), moments)
 
 
 def test_kaplan_and_meier_by_hand():
@@ -306,6 +315,46 @@ def test_random_switches_are_put_together_by_their_modes(tmp_path):
         assert sum(r["detected"] for r in own) == row["detected"]
         probability = [r["probability"] for r in own]
         assert probability == sorted(probability)
+
+
+def test_what_the_data_cut_short_is_no_never(tmp_path):
+    """A switch at the last step but two: MMAE takes six."""
+    changes = [
+        "truth.legs=[{until_s: 87}, {until_s: 90, acceleration_m_s2: [1.5, 1.5], mode: CT}]",
+        "published=[]",
+        "monte_carlo.runs=50",
+    ]
+    experiment.run(config.load("mode_delay_fig4", changes), tmp_path / "a", 2, quiet)
+    rows = {r["estimator"]: r for r in results.read_rows(tmp_path / "a", "delays") if r["switch"]}
+    assert (rows["IMM"]["averaged_delay"], rows["MMAE"]["averaged_delay"]) == ("1", "over 3")
+    assert (rows["MMAE"]["missed"], rows["MMAE"]["unfinished"]) == (0, 50)
+
+
+def test_estimates_that_were_so_before_the_switch_are_counted(tmp_path):
+    shipped = config.load("rmimm_fig5", ["monte_carlo.runs=256"])
+    experiment.run(shipped, tmp_path / "a", 2, quiet)
+    rows = {(r["estimator"], r["switch"]): r for r in results.read_rows(tmp_path / "a", "delays")}
+    steps = results.read_columns(tmp_path / "a", "steps")
+    for label, switch, before in (("RMIMM", 2, "CV"), ("MMAE", 3, "CT"), ("IMM", 2, "CV")):
+        row = rows[label, switch]
+        last = steps["step"] == row["step"] - 1
+        mine = last & (steps["estimator"] == label) & (steps["metric"] == f"mode_estimate:{before}")
+        assert row["already_share"] == pytest.approx(steps["value"][mine][0], abs=1e-12)
+    assert rows["MMAE", 3]["already_share"] == 1.0
+    assert rows["IMM", 2]["already_share"] < 0.05 < 0.25 < rows["RMIMM", 2]["already_share"]
+
+
+def test_false_switches_of_all_stays_together(tmp_path):
+    shipped = config.load("rmimm_fig5", ["monte_carlo.runs=256"])
+    experiment.run(shipped, tmp_path / "a", 2, quiet)
+    rows = results.read_rows(tmp_path / "a", "delays")
+    summary = results.read_rows(tmp_path / "a", "summary")
+    (found,) = [
+        r for r in summary if r["metric"] == "false_switches_per_stay" and r["estimator"] == "RMIMM"
+    ]
+    own = [row["false_switches"] for row in rows if row["estimator"] == "RMIMM"]
+    assert found["value"] == pytest.approx(np.mean(own))  # each run has every stay once
+    assert 0 < found["standard_error"] < 0.1
 
 
 def test_a_truth_without_switches_has_no_delays(tmp_path):

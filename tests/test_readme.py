@@ -22,6 +22,6 @@ def test_every_command_scenario_and_estimator_is_named():
     for command in app.registered_commands:
         name = command.name or command.callback.__name__
         assert f"hybridtrack {name}" in text
-    for kind in ("estimators", "scenarios"):
+    for kind in ("estimators", "analyses", "scenarios"):
         for name in catalogue()[kind]:
             assert f"`{name}`" in text

@@ -16,6 +16,7 @@ import numpy as np
 
 from hybridtrack.analyses._findings import Band, Chart, Findings, Line, Mark, Panel, Table
 from hybridtrack.description import Experiment
+from hybridtrack.errors import Unsuited
 from hybridtrack.models import JumpMarkovModel
 from hybridtrack.simulation import step_lengths
 
@@ -30,6 +31,7 @@ __all__ = [
     "Panel",
     "Table",
     "analyses",
+    "lint",
     "model_at_one_step",
 ]
 
@@ -52,7 +54,7 @@ class Analysis(NamedTuple):
     summary: str
     source: str  # author, year, section
     settings: type[Any]  # a NamedTuple: types, and defaults
-    # (experiment, settings, measured): Findings. Raises UserError where a scenario cannot be
+    # (experiment, settings, measured): Findings. Raises Unsuited where a scenario cannot be
     # analysed, in one sentence with the remedy.
     analyse: Callable[[Experiment, Any, Measured | None], Findings]
     example: str  # a shipped scenario that it is about
@@ -70,6 +72,20 @@ def analyses() -> Mapping[str, Analysis]:
             analysis = importlib.import_module(f"{__name__}.{module.name}").ANALYSIS
             found[analysis.name] = analysis
     return dict(sorted(found.items()))
+
+
+def lint(experiment: Experiment) -> list[str]:
+    """What theory finds too short in a scenario's truth, in whole sentences; quick.
+
+    Nothing where theory has nothing to say of it.
+    """
+    from hybridtrack.analyses._short_stretches import warnings_about_legs
+
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return warnings_about_legs(experiment)
+    except Unsuited:
+        return []
 
 
 def model_at_one_step(experiment: Experiment) -> tuple[JumpMarkovModel, tuple[str, ...]]:

@@ -99,7 +99,7 @@ def _distributions(measured: Measured, rows: Sequence[Row]) -> Chart:
                 )
                 x, p, error = (np.concatenate([[0.0], part]) for part in (x, p, error))
                 lines.append(Line(label, x, p, steps="post"))
-                bands.append(Band(label, x, p - ERRORS * error, p + ERRORS * error))
+                bands.append(Band(label, x, p - ERRORS * error, p + ERRORS * error, "post"))
         said = f"{switch[2]} to {switch[3]}" + (
             f"\nat {_time(rows, switch):g} s" if switch[1] else ""
         )

@@ -2,14 +2,18 @@
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from hybridtrack.delays import MOST_ALREADY
 
 Row = Mapping[str, Any]
 
 NOTES = (
     "bounds are for filters in steady state that run alone; an IMM mixes, so for it they are right "
     "at the first step only; no: never satisfied, –: a premise fails (table.csv says which)",
+    f"*: in over {MOST_ALREADY:.0%} of the runs the estimate was the new mode before the switch "
+    "already",
     "(14) and after print 2 ln |S_i|/|S_T|: the density needs |S|^(-1/2), so it is ln",
     "(18) bounds the wrong filter's residual by the least singular values of wide matrices; the "
     "greatest lower bound is 0, and 0 is taken",
@@ -20,34 +24,47 @@ NOTES = (
     "proposition 4.4 needs P(T next | j now)/P(j next | j now): row j here, the transpose as "
     "printed; and its errors are those at k_l, not at k_l - 1",
     "tuning_concordance: 1 where a smaller first term of (21) always comes with a shorter delay, "
-    "-1 with a longer one, over noises of a quarter to four times (tuning.parquet)",
+    "-1 with a longer one, over noises of a quarter to four times, one at a time (tuning.parquet)",
 )
+BOUNDS = tuple(f"proposition_4_{name}" for name in ("2", "3", "4"))
 
 
-def steps(delay: float | None) -> str:
-    """A delay in words of a table."""
-    if delay is None or math.isnan(delay):
-        return ""
-    return "never" if math.isinf(delay) else f"{delay:.0f}"
+NEARLY = 0.05  # relative difference of two terms that are alike
+
+
+def is_noticed(row: Row) -> bool:
+    """Whether a delay was measured that is one: most runs weren't in the new mode already."""
+    return measured_delay(row) is not None and row["already_share"] <= MOST_ALREADY
 
 
 def measured_delay(row: Row) -> float | None:
-    """Of the run-averaged mode estimate; the runs' median where each has its own switches."""
+    """Of the run-averaged mode estimate; the runs' median where each has its own switches.
+
+    None where there was no switch, or where the data ended before the mode was noticed.
+    """
     averaged: float | None = row["averaged_delay_steps"]
-    median: float | None = row["median_delay_steps"]
-    return median if averaged is None else averaged
+    if averaged is None:
+        median: float | None = row["median_delay_steps"]
+        return median
+    return None if str(row["averaged_delay"]).startswith("over") else averaged
 
 
 def _measured(row: Row) -> str:
-    averaged = row["averaged_delay_steps"]
-    if averaged is None:
-        mean, error = row["detection_delay_steps"], row["detection_delay_steps_standard_error"]
-        if mean is None:
-            return "no switch"
-        spread = "" if math.isnan(mean) else f", mean {mean:.2f}±{error:.2f}"
-        return f"{steps(row['median_delay_steps'])}{spread}"
+    """A delay as a table says it, with what it may be, or the share of switches that are missed."""
+    if row["median_delay_steps"] is None:
+        return "no switch"
+    star = "*" * bool(row["already_share"] > MOST_ALREADY)
+    if row["averaged_delay_steps"] is None:
+        median, missed = row["median_delay_steps"], row["missed_share"]
+        text = "never" if math.isinf(median) else f"{median:.0f}"
+        return text + f", {missed:.0%} missed" * bool(missed >= 0.005) + star
     low, high = row["averaged_delay_steps_low"], row["averaged_delay_steps_high"]
-    return steps(averaged) + (f" ({steps(low)} to {steps(high)})" if low != high else "")
+    text = str(row["averaged_delay"])
+    return text + (f" ({_plain(low)}-{_plain(high)})" if low != high else "") + star
+
+
+def _plain(delay: float) -> str:
+    return "∞" if math.isinf(delay) else f"{delay:.0f}"
 
 
 def name(row: Row, several_cases: bool = False) -> str:
@@ -63,28 +80,24 @@ def shown(rows: Sequence[Row]) -> dict[str, list[str]]:
     """What a terminal shows; the first of a switch's rows names it."""
     several = len({row["case"] for row in rows}) > 1
     names = [name(row, several) for row in rows]
-    cells = {
+    return {
         "switch": [n if i == 0 or n != names[i - 1] else "" for i, n in enumerate(names)],
         "estimator": [row["estimator"] for row in rows],
         "delay,\nsteps": [_measured(row) for row in rows],
-        "pre-\ndicted": [steps(row["mean_trajectory_delay_steps"]) for row in rows],
+        "pre-\ndicted": [row["mean_trajectory_delay"] for row in rows],
+        "4.1": [_bound(row, ["proposition_4_1"]) for row in rows],
+        "4.2 to\n4.4": [_bound(row, BOUNDS) for row in rows],
     }
-    for heading, key in (
-        ("4.1", "proposition_4_1"),
-        ("4.2\n(1)", "proposition_4_2_condition_1"),
-        ("4.2\n(2)", "proposition_4_2_condition_2"),
-        ("4.3", "proposition_4_3"),
-        ("4.4", "proposition_4_4"),
-    ):
-        cells[heading] = [_bound(row, key) for row in rows]
-    return cells
 
 
-def _bound(row: Row, key: str) -> str:
-    if row[f"{key}_result"] is None:
+def _bound(row: Row, keys: Sequence[str]) -> str:
+    """The least of several bounds."""
+    if row[f"{keys[0]}_result"] is None:
         return ""
-    delay = row[f"{key}_delay_steps"]
-    return "–" if delay is None else "no" if math.isinf(delay) else f"{delay:.0f}"
+    delays = [d for key in keys if (d := row[f"{key}_delay_steps"]) is not None]
+    if not delays:
+        return "–"
+    return "no" if math.isinf(min(delays)) else f"{min(delays):.0f}"
 
 
 # ---- conclusions -----------------------------------------------------------------------------
@@ -92,18 +105,12 @@ def _bound(row: Row, key: str) -> str:
 
 def conclusions(rows: Sequence[Row], pairs: Sequence[Row], runs: int) -> list[str]:
     """What a practitioner should conclude, in whole sentences."""
-    said = _who_notices(rows, runs)
-    said += _how_predicted(rows)
-    said += _which_direction(rows, pairs)
-    said += _what_is_promised(rows)
-    alike = [p for p in pairs if p.get("means_indistinguishable")]
-    if alike:
-        named = ", ".join(f"{p['from_mode']} to {p['to_mode']}" for p in alike)
-        said.append(
-            "These modes have the same mean, so that a switch shows in the noise alone and no mean "
-            f"trajectory tells of it: {named}."
-        )
-    return said
+    return [
+        *_who_notices(rows, runs),
+        *_how_predicted(rows),
+        *_which_direction(rows, pairs),
+        *_what_is_bounded(rows),
+    ]
 
 
 def _by_estimator(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -114,29 +121,61 @@ def _by_estimator(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def _who_notices(rows: Sequence[Row], runs: int) -> list[str]:
-    parts, totals = [], {}
-    for estimator, own in _by_estimator(rows).items():
+    parts, left_out = [], 0
+    bounds: dict[str, tuple[float, float]] = {}
+    for estimator, all_rows in _by_estimator(rows).items():
+        own = [row for row in all_rows if is_noticed(row)]
+        left_out += sum(row["already_share"] > MOST_ALREADY for row in all_rows if _happened(row))
         delays = [d for row in own if (d := measured_delay(row)) is not None]
         noticed = [d for d in delays if math.isfinite(d)]
-        never = len(delays) - len(noticed)
         if not delays:
             continue
-        words = f"{estimator} in "
-        words += "no" if not noticed else _range(noticed)
-        words += " step" if noticed and max(noticed) == 1 else " steps"
-        words += f" and {never} of {len(delays)} never" * bool(never)
+        words = f"{estimator} " + ("never" if not noticed else f"after {_range(noticed)}")
+        if noticed:
+            words += " step" if max(noticed) == 1 else " steps"
+            never = len(delays) - len(noticed)
+            words += f" ({never} of {len(delays)} never)" * bool(never)
         parts.append(words)
-        totals[estimator] = sum(math.inf if math.isinf(d) else d for d in delays)
+        if len(own) == len(all_rows) and own[0]["averaged_delay_steps"] is not None:
+            ends = ("averaged_delay_steps_low", "averaged_delay_steps_high")
+            low, high = (sum(row[end] for row in own) for end in ends)
+            bounds[estimator] = (low, high)
     if not parts:
-        return ["No switch happened in any run, so nothing was measured."]
+        return ["No switch was there to be noticed in any run."]
     count = len({(row["case"], row["switch"], row["from_mode"], row["to_mode"]) for row in rows})
-    kind = "kinds of switches" if rows[0]["switch"] is None else "switches"
-    sentence = f"Over {runs:,} runs and {count} {kind}, a switch is noticed by {', '.join(parts)}."
-    best = min(totals, key=lambda label: totals[label])
-    alone = [label for label, total in totals.items() if total == totals[best]]
-    if len(totals) > 1 and len(alone) == 1:
-        sentence += f" {best} is the soonest."
-    return [sentence]
+    kind = "kind of switch" if rows[0]["switch"] is None else "switch"
+    kinds = kind if count == 1 else kind.replace("kind", "kinds").replace("switch", "switches")
+    sentence = (
+        f"Over {runs:,} run{'s' * (runs != 1)} and {count} {kinds}, a switch is noticed by "
+        f"{', by '.join(parts)}."
+    )
+    for best, (_, high) in bounds.items():
+        others = [low for label, (low, _) in bounds.items() if label != best]
+        if len(bounds) == len(_by_estimator(rows)) > 1 and high < min(others):
+            sentence += f" {best} is the soonest."
+    if left_out:
+        sentence += (
+            f" Not counted: {left_out} delays (*) of estimates that had been in the new mode "
+            "before the switch."
+        )
+    return [sentence, *_what_is_false(rows)]
+
+
+def _happened(row: Row) -> bool:
+    return row["already_share"] is not None
+
+
+def _what_is_false(rows: Sequence[Row]) -> list[str]:
+    """Who leaves the right mode again."""
+    worst: dict[str, float] = {}
+    for row in rows:
+        if row["false_switches"] is not None and not math.isnan(row["false_switches"]):
+            label = row["estimator"]
+            worst[label] = max(worst.get(label, 0.0), row["false_switches"])
+    named = [f"{label} up to {value:.2g}" for label, value in worst.items() if value >= 0.05]
+    if not named:
+        return []
+    return [f"False switches per stay, away from the right mode: {', '.join(named)} times."]
 
 
 def _range(values: Sequence[float]) -> str:
@@ -148,65 +187,70 @@ def _how_predicted(rows: Sequence[Row]) -> list[str]:
     held = [
         (row["mean_trajectory_delay_steps"], delay)
         for row in rows
-        if (delay := measured_delay(row)) is not None
-        and not math.isnan(delay)
+        if is_noticed(row)
+        and (delay := measured_delay(row)) is not None
         and not math.isnan(row["mean_trajectory_delay_steps"])
     ]
     if not held:
         return []
     exact = sum(one == other for one, other in held)
     close = sum(one == other or abs(one - other) <= 1 for one, other in held)
+    delays = "delay" if len(held) == 1 else "delays"
     return [
-        f"Measurements without noise predict {exact} of {len(held)} delays exactly and {close} "
+        f"Measurements without noise predict {exact} of {len(held)} {delays} exactly and {close} "
         "within one step."
     ]
 
 
 def _which_direction(rows: Sequence[Row], pairs: Sequence[Row]) -> list[str]:
-    """By the first term, and whether the measured delays agree."""
+    """By the first term, by all of eq. 21, and whether the measured delays agree."""
     said = []
     terms = {(p["from_mode"], p["to_mode"]): p.get("first_term") for p in pairs}
     for (a, b), term in terms.items():
         back = terms.get((b, a))
-        if term is None or back is None or not term < back:
+        if term is None or back is None or not term < (1.0 - NEARLY) * back:
             continue
-        delays = {
-            modes: [
-                d
-                for row in rows
-                if (row["from_mode"], row["to_mode"]) == modes
-                and (d := measured_delay(row)) is not None
-            ]
-            for modes in ((a, b), (b, a))
-        }
         sentence = (
             f"By the residual covariances {a} to {b} is easier to notice than {b} to {a} (first "
             f"term of eq. 21: {term:.3g} against {back:.3g})"
         )
-        there, other = (delays[m] for m in ((a, b), (b, a)))
-        if there and other:
-            one, two = (statistics.median(part) for part in (there, other))
-            agree = "as" if one < two else "but not as"
-            words = "never" if math.isinf(one) else f"{one:.3g}"
-            others = "never" if math.isinf(two) else f"{two:.3g}"
-            sentence += f", {agree} measured: {words} against {others} steps"
-            sentence += " (medians over estimators and switches)"
+        there, other = (_median(rows, modes, measured_delay) for modes in ((a, b), (b, a)))
+        if there is not None and other is not None:
+            agree = "and so it is" if there < other else "but it is not"
+            agree = "but both take as long" if there == other else agree
+            sentence += (
+                f", {agree}: {_plain_or_never(there)} against {_plain_or_never(other)} steps"
+            )
+        sums = [
+            _median(rows, modes, lambda row: row["sum_of_logarithms"]) for modes in ((a, b), (b, a))
+        ]
+        if sums[0] is not None and sums[1] is not None and sums[0] > sums[1]:
+            sentence += (
+                f"; all three terms together say the opposite ({sums[0]:.3g} against "
+                f"{sums[1]:.3g}), for the errors at the switch"
+            )
         said.append(sentence + ".")
     return said[:3]
 
 
-def _what_is_promised(rows: Sequence[Row]) -> list[str]:
-    names = ("4_2_condition_1", "4_2_condition_2", "4_3", "4_4")
+def _plain_or_never(delay: float) -> str:
+    return "never" if math.isinf(delay) else f"{delay:.3g}"
+
+
+def _median(
+    rows: Sequence[Row], modes: tuple[str, str], of: Callable[[Row], float | None]
+) -> float | None:
+    """Over estimators and switches of one kind."""
+    own = [row for row in rows if (row["from_mode"], row["to_mode"]) == modes and is_noticed(row)]
+    values = [value for row in own if (value := of(row)) is not None]
+    return statistics.median(values) if values else None
+
+
+def _what_is_bounded(rows: Sequence[Row]) -> list[str]:
     bounded = [row for row in rows if row["proposition_4_1_result"] is not None]
-    promised = [
-        row
-        for row in bounded
-        if any((row[f"proposition_{n}_delay_steps"] or math.inf) < math.inf for n in names)
-    ]
+    some = [row for row in bounded if _bound(row, BOUNDS).isdecimal()]
     if not bounded:
         return []
-    if not promised:
-        return ["None of the propositions 4.2 to 4.4 promises that any of these is noticed at all."]
-    return [
-        f"Propositions 4.2 to 4.4 promise a delay for {len(promised)} of {len(bounded)} of these."
-    ]
+    if not some:
+        return ["None of the propositions 4.2 to 4.4 has a bound for any of these delays."]
+    return [f"Propositions 4.2 to 4.4 have a bound for {len(some)} of {len(bounded)} of these."]

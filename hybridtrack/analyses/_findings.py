@@ -4,9 +4,11 @@ Nothing here is drawn or written: other rooms do that, for all analyses alike.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from hybridtrack.models import Array
+
+Steps = Literal["", "pre", "post"]
 
 
 class Table(NamedTuple):
@@ -27,7 +29,7 @@ class Line(NamedTuple):
     x: Array  # (n,)
     y: Array  # (n,)
     reference: bool = False  # thin and black: what the others are held against
-    steps: str = ""  # "pre" or "post": constant before or after each point; else straight lines
+    steps: Steps = ""  # "pre" or "post": constant before or after each point; else straight lines
 
 
 class Band(NamedTuple):
@@ -37,6 +39,7 @@ class Band(NamedTuple):
     x: Array  # (n,)
     low: Array  # (n,)
     high: Array  # (n,)
+    steps: Steps = ""  # as a Line's
 
 
 class Mark(NamedTuple):

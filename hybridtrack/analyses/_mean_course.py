@@ -23,6 +23,7 @@ from hybridtrack.simulation import (
 from hybridtrack.vectors import WIDTH
 
 SPAN_STEPS = 75
+OTHER_BLOCK = 1_000_000  # whose truths no run has
 BEFORE, AFTER = 100, 200  # steps of a chain's modes, before and after a switch
 
 
@@ -212,14 +213,15 @@ def noise_free_delays(
 ) -> dict[tuple[str, str], Delays]:
     """By case and estimator, the delays in one block of a chain's own truths, without noise.
 
-    The truths are those of the scenario's first runs; groups are pairs of modes as in delays.
+    The truths are none that runs of the scenario have; groups are pairs of modes as in delays.
     """
     found: dict[tuple[str, str], Delays] = {}
     for number, case in enumerate(experiment.cases):
         if not isinstance(case.truth, ChainTruth):
             continue
         step_s = step_lengths(case.times_s)
-        block = BlockSimulation(case, experiment.sensor, experiment.seed, number, 0, BLOCK_RUNS)
+        key = (experiment.seed, number, OTHER_BLOCK)
+        block = BlockSimulation(case, experiment.sensor, *key, BLOCK_RUNS)
         known = block.state_names
         positions = [known.index(axis) for axis in "xy" if axis in known]
         banks: dict[str, _Bank] = {}
@@ -282,6 +284,7 @@ class MeanBank(NamedTuple):
     residual: Array  # (n_steps, n_modes, n_y)
     start: Array  # (n_steps, n_modes, n_x) each filter's estimate that the step begins with
     log_predicted: Array  # (n_steps, n_modes) logarithm of the predicted mode probabilities
+    log_probability: Array  # (n_steps, n_modes) and of those after the step's measurement
 
 
 def run_mean_bank(
@@ -301,6 +304,7 @@ def run_mean_bank(
     residual = np.empty((n, n_modes, len(measurements[0])))
     begun = np.empty((n, n_modes, len(mean)))
     log_predicted = np.empty((n, n_modes))
+    after = np.empty((n, n_modes))
     estimate = np.repeat(mean[np.newaxis], n_modes, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_transition = np.log(transition)
@@ -323,4 +327,5 @@ def run_mean_bank(
             ]
             log_probability = log_predicted[k] + log_likelihood
             log_probability = log_probability - np.logaddexp.reduce(log_probability)
-    return MeanBank(residual, begun, log_predicted)
+            after[k] = log_probability
+    return MeanBank(residual, begun, log_predicted, after)

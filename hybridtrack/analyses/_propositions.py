@@ -14,15 +14,16 @@ What is printed otherwise, and computed so where `as_printed` is:
   the greatest lower bound is 0, and so it is taken here;
 - condition 2 of proposition 4.2 divides by ln(sigma_min(F_i)/sigma_max(F_T)), which must be
   positive, or the inequality turns round; its C_T A_T is wide too, and ||a + b||^2 is taken for
-  ||a||^2 + ||b||^2;
+  ||a||^2 + ||b||^2; J is printed with b at k_l + delta - 2, and b is that at k_l + delta - 1;
 - beta(k_l + delta) of proposition 4.2 rests on mode probabilities after the switch. Taken from the
   mean trajectory it holds once the mode was noticed, which was to be predicted (`..._along`); it is
   a prediction with beta(k_l + 1), which is known at the switch;
 - proposition 4.4 has e at k_l - 1 and one factor [F_i G_x G_u] too many for that; and with the
   paper's transition matrix, whose columns sum to 1 (eq. 2), its pi_jT/pi_jj is the transpose's.
 
-Errors grow by F_T from step to step in filters that run alone. The IMM's mix, so that of it the
-bounds are right at the first step only.
+All need the bank to have estimated the old mode when it ended; 4.3 and 4.4 a transition matrix that
+is diagonally dominant, as is said before them. Errors grow by F_T from step to step in filters that
+run alone. The IMM's mix, so that of it the bounds are right at the first step only.
 """
 
 import math
@@ -40,6 +41,7 @@ ROUNDING = 1e-10  # relative to the state: errors below it are none
 CONDITIONS = (
     "proposition_4_1",
     "proposition_4_1_condition_3",
+    "proposition_4_2",
     "proposition_4_2_condition_1",
     "proposition_4_2_condition_1_along",
     "proposition_4_2_condition_2",
@@ -141,7 +143,7 @@ def rival(
         holds = {
             "proposition_4_1": (rest > 0) & (own < rest),
             "proposition_4_1_condition_3": (rest > 0) & (squares_T < d.alpha * squares_i + beta),
-            "proposition_4_2_condition_1": left < beta[0] + right,
+            "proposition_4_2_condition_1": (rest > 0) & (left < beta[0] + right),
             "proposition_4_2_condition_1_along": (rest > 0) & (left < beta + right),
             "proposition_4_2_condition_2": np.zeros(len(steps), dtype=bool),
             "proposition_4_3": left < right + (ln_S + 2.0 * leaves) / information,
@@ -152,10 +154,16 @@ def rival(
             inner += 2.0 * (np.log(error_T) - np.log(error_i))
             bound = 1.0 + inner / (2.0 * (np.log(least_F_i) - np.log(sigma_F_T)))
             squares_b = _without_start(stay, CA, d.F_i)
-            holds["proposition_4_2_condition_2"] = (steps + 1.0 > bound) & (
-                d.alpha * squares_b + beta[0] >= 0
-            )
+            not_negative = d.alpha * squares_b + beta[0] >= 0
+            holds["proposition_4_2_condition_2"] = (rest > 0) & (steps + 1.0 > bound) & not_negative
+        holds["proposition_4_2"] = (
+            holds["proposition_4_2_condition_1"] | holds["proposition_4_2_condition_2"]
+        )
     premise: dict[str, str] = {}
+    if not _is_dominant(transition):
+        premise["proposition_4_3"] = premise["proposition_4_4"] = (
+            "the transition matrix is not diagonally dominant"
+        )
     if len(filters) != 2:
         premise["proposition_4_3"] = f"it is for two modes, and there are {len(filters)}"
     if not as_printed and least_F_i <= sigma_F_T:
@@ -217,15 +225,17 @@ def _without_start(stay: _Stay, CA: Array, F_i: Array) -> Array:
     return squares
 
 
+def _is_dominant(transition: Array) -> bool:
+    """Whether every mode rather stays than leaves."""
+    return bool((np.diagonal(transition) > 0.5).all())
+
+
 def _smallest_ratio(transition: Array, new: int, as_printed: bool) -> float:
     """The least P(mode T next | mode j now) / P(mode j next | mode j now), j other than T."""
     entries = transition[new] if as_printed else transition[:, new]
     stays = np.diagonal(transition)
-    ratios = [
-        entries[j] / stays[j] if stays[j] > 0 else math.inf
-        for j in range(len(transition))
-        if j != new
-    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = [entries[j] / stays[j] for j in range(len(transition)) if j != new]
     return float(min(ratios))
 
 

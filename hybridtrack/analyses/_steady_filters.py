@@ -143,7 +143,7 @@ def steady_residual(i: SteadyFilter, T: SteadyFilter, state: Array) -> SteadyRes
     d = difference(i, T)
     x, estimate = state.copy(), state.copy()
     drive = np.concatenate([d.G_x, d.H_x])
-    before, settled = estimate, np.zeros(len(drive))
+    before, settled, early = estimate, np.zeros(len(drive)), np.zeros(len(drive))
     residual = np.zeros(len(T.C))
     for step in range(SETTLING):
         before = estimate
@@ -155,9 +155,13 @@ def steady_residual(i: SteadyFilter, T: SteadyFilter, state: Array) -> SteadyRes
             return SteadyResidual(None, None, "no steady state: the estimate grows")
         if step == SETTLING * 9 // 10:
             settled = drive @ before
+        if step < SETTLING // 2:
+            early = np.maximum(early, np.abs(drive @ before))
     scale = max(float(np.abs(settled).max()), float(np.abs(residual).max()), 1e-9)
     if not np.abs(drive @ before - settled).max() <= STEADY * scale:
-        return SteadyResidual(None, None, "no steady state: the estimate grows")
+        grows = float(np.abs(drive @ before).max()) > 1.05 * float(np.abs(early).max())
+        how = "grows" if grows else "keeps moving"
+        return SteadyResidual(None, None, f"no steady state: the estimate {how}")
     theta_inverse = np.eye(len(T.A)) - d.F_i
     if np.linalg.cond(theta_inverse) > 1e12:
         reason = "premise fails: I - F_i is singular, so there is no Theta"

@@ -7,7 +7,7 @@ Hwang, Balakrishnan, Tomlin 2006, section 4; see _propositions for what is wrong
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,9 @@ import numpy as np
 from hybridtrack.analyses import Analysis, Findings, Measured, Table, model_at_one_step
 from hybridtrack.analyses import _delay_charts as charts
 from hybridtrack.analyses._delay_words import NOTES, conclusions, shown
+from hybridtrack.analyses._directions import pairs_of_modes
 from hybridtrack.analyses._mean_course import (
+    BEFORE,
     Course,
     MeanBank,
     Switch,
@@ -28,27 +30,24 @@ from hybridtrack.analyses._mean_course import (
     states_of_bank,
 )
 from hybridtrack.analyses._propositions import CONDITIONS, Ingredients, Rival, bounds, rival
-from hybridtrack.analyses._steady_filters import (
-    Difference,
-    NoSteadyState,
-    SteadyFilter,
-    difference,
-    steady_filters,
-    steady_residual,
-)
+from hybridtrack.analyses._steady_filters import NoSteadyState, SteadyFilter, steady_filters
+from hybridtrack.analyses._tuning import MOST_STEPS, concordance, of_switch, tuned
 from hybridtrack.delays import Delays, distribution
 from hybridtrack.description import ChosenEstimator, Experiment
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Unsuited
+from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Array, JumpMarkovModel
 
 COMPARED = ("imm", "mmae")  # types of estimators that the bounds are about
-FACTORS = (0.25, 0.5, 2.0, 4.0)  # of the noise that filters believe in, one at a time
-MOST_TUNED = 5000  # steps of a course whose tuning is tried
 MEASURED = (
     "sojourns",
     "averaged_delay_steps",
     "averaged_delay_steps_low",
     "averaged_delay_steps_high",
+    "averaged_delay",
+    "stay_steps",
+    "already_share",
+    "already_share_standard_error",
     "detection_delay_steps",
     "detection_delay_steps_standard_error",
     "median_delay_steps",
@@ -71,20 +70,21 @@ def _wants(experiment: Experiment) -> tuple[str, ...]:
     """The scenario with an IMM and a bank without mixing, where it has none."""
     switches = [switch for course in courses(experiment) for switch in course.switches]
     if not switches:
-        raise UserError(
-            f"{experiment.name}: the truth has no switch of mode that could be noticed; give its "
-            "legs several modes, or a chain"
+        raise Unsuited(
+            "the truth has no switch of mode that could be noticed; give its legs several modes, "
+            "or a chain",
+            "truth",
         )
     if len(experiment.bank.modes) < 2:
-        raise UserError(
-            f"{experiment.name}: the filters have one mode, and nothing to notice; add another to "
-            "'modes'"
+        raise Unsuited(
+            "the filters have one mode, and nothing to notice; add another to 'modes'", "modes"
         )
     known = {*experiment.bank.names}
     if not any({switch.from_mode, switch.to_mode} <= known for switch in switches):
-        raise UserError(
-            f"{experiment.name}: the truth never switches between two of the filters' modes "
-            f"({', '.join(experiment.bank.names)}); call the modes alike"
+        raise Unsuited(
+            "the truth never switches between two of the filters' modes "
+            f"({', '.join(experiment.bank.names)}); call the modes alike",
+            "truth",
         )
     types = {chosen.estimator.name for chosen in experiment.estimators}
     labels = {chosen.label for chosen in experiment.estimators}
@@ -113,7 +113,11 @@ def _analyse(experiment: Experiment, settings: Settings, measured: Measured | No
             probabilities = mode_probabilities(experiment, course, chosen)
             predictions[course.case, chosen.label] = probabilities
             bank = _steady_bank(experiment, course, chosen, model)
-            tuned = _tuned(experiment, course, chosen, model)
+            tuned_courses = (
+                tuned(experiment, course, chosen, model)
+                if chosen.estimator.name in COMPARED
+                else []
+            )
             for switch in course.switches:
                 names = chosen.bank.names
                 if not {switch.from_mode, switch.to_mode} <= set(names):
@@ -123,28 +127,62 @@ def _analyse(experiment: Experiment, settings: Settings, measured: Measured | No
                 new = names.index(switch.to_mode)
                 row = _key(course, switch, chosen) | _measured(measured, course, switch, chosen)
                 drawn = noise_free.get((course.case, chosen.label))
-                row["mean_trajectory_delay_steps"] = (
+                delay = (
                     predicted_delay(probabilities, new, switch)
                     if drawn is None
                     else _median(drawn, experiment, switch)
                 )
+                row["mean_trajectory_delay_steps"] = delay
+                row["mean_trajectory_delay"] = _said(delay, switch, course)
                 row |= _bounded(bank, truth, switch, model, settings)
-                own = _tuning(tuned, switch, names)
+                own = of_switch(tuned_courses, switch, names)
                 row["tuning_concordance"] = concordance(
-                    [one["first_term"] for one in own], [one["delay_steps"] for one in own]
+                    [(one["mode"], one["parameter"]) for one in own],
+                    [one["first_term"] for one in own],
+                    [one["delay_steps"] for one in own],
                 )
                 tunings += [_key(course, switch, chosen) | one for one in own]
                 rows.append(row)
-    rows.sort(key=lambda row: (row["case"], row["switch"] or 0))
-    pairs = _pairs(filters, model, states, rows, settings)
+    order = [case.name for case in experiment.cases]
+    rows.sort(key=lambda row: (order.index(row["case"]), row["switch"] or 0))
+    pairs = pairs_of_modes(filters, model, states, rows)
     table = _table(rows)
     return Findings(
         table=table._replace(shown=shown(rows)),
         conclusions=conclusions(rows, pairs, measured.runs),
-        notes=(*notes, *NOTES),
+        notes=(*notes, *_limits(experiment), *NOTES),
         tables={"pairs": _table(pairs), "tuning": _table(tunings)},
         charts=charts.charts(experiment, measured, predictions, rows),
     )
+
+
+def _said(delay: float, switch: Switch, course: Course) -> str:
+    """A predicted delay in words: a stay that the data cut short tells no more than its length."""
+    if math.isnan(delay):
+        return "no switch"
+    if math.isfinite(delay):
+        return f"{delay:.0f}"
+    cut_short = switch.number is not None and switch.last == len(course.measurements)
+    return f"over {switch.last - switch.step + 1}" if cut_short else "never"
+
+
+def _limits(experiment: Experiment) -> list[str]:
+    """What the prediction and the bounds leave out here."""
+    notes = []
+    sensor = experiment.sensor
+    if sensor.detection_probability < 1.0 or sensor.outliers is not None:
+        notes.append(
+            "prediction and bounds know of no missed scan and no outlier; the runs have them"
+        )
+    if any(isinstance(case.truth, ChainTruth) for case in experiment.cases):
+        notes.append(
+            "the truth is drawn anew in every run: predicted is the median over truths of their "
+            "own, measured without noise; bounds and tuning are along the chain's mean, which "
+            f"switches once, after {BEFORE} steps"
+        )
+    if any(len(case.times_s) - 1 > MOST_STEPS for case in experiment.cases):
+        notes.append(f"tuning is not tried on tracks of more than {MOST_STEPS:,} steps")
+    return notes
 
 
 def _median(drawn: Delays, experiment: Experiment, switch: Switch) -> float:
@@ -201,6 +239,13 @@ def _measured(
 class _SteadyBank(NamedTuple):
     filters: list[SteadyFilter]
     course: MeanBank
+    begun: int  # scans that a start is made from
+
+    def estimate(self, step: int) -> int | None:
+        """The most probable mode after a step, from 1; None before there is one."""
+        if step <= self.begun:
+            return None
+        return int(np.argmax(self.course.log_probability[step - 1]))
 
 
 def _steady_bank(
@@ -222,7 +267,7 @@ def _steady_bank(
     bank = run_mean_bank(filters, own, course.measurements[used:], mean, mixing)
     pad = [(used, 0)]
     whole = (np.pad(array, pad + [(0, 0)] * (array.ndim - 1)) for array in bank)
-    return _SteadyBank(filters, MeanBank(*whole))
+    return _SteadyBank(filters, MeanBank(*whole), used)
 
 
 def _bounded(
@@ -239,6 +284,8 @@ def _bounded(
     new, left = names.index(switch.to_mode), names.index(switch.from_mode)
     if bank is not None and truth is None:
         bank = "the truth has not all of the filters' states"
+    elif isinstance(bank, _SteadyBank) and bank.estimate(switch.step - 1) != left:
+        bank = f"without noise the bank does not estimate {switch.from_mode} before the switch"
     against: Rival | None = None
     for suffix, as_printed in versions.items():
         for name in CONDITIONS:
@@ -270,173 +317,6 @@ def _terms(of: Ingredients) -> tuple[float, float, float, float]:
         third = np.float64(of.error_T) / of.error_i
         total = 0.5 * np.log(first) + np.log(second) + np.log(third)
     return float(first), float(second), float(third), float(total)
-
-
-# ---- tuning ----------------------------------------------------------------------------------
-
-
-class _Tuned(NamedTuple):
-    mode: str
-    parameter: str
-    factor: float
-    filters: list[SteadyFilter | NoSteadyState]
-    probabilities: Array
-
-
-def _tuned(
-    experiment: Experiment, course: Course, chosen: ChosenEstimator, model: JumpMarkovModel
-) -> list[_Tuned]:
-    """The course again with the noise that the filters believe in changed, one at a time."""
-    if len(course.measurements) > MOST_TUNED or chosen.estimator.name not in COMPARED:
-        return []
-    found = []
-    changes: list[tuple[str, str, float]] = [("", "", 1.0)]
-    changes += [
-        (mode, parameter, factor)
-        for mode in model.mode_names
-        for parameter in ("process_noise_covariance", "measurement_noise_covariance")
-        for factor in FACTORS
-    ]
-    for mode, parameter, factor in changes:
-        change = _scaling(mode, parameter, factor)
-        probabilities = mode_probabilities(experiment, course, chosen, change)
-        own = chosen.estimator.prepare(chosen.settings, change(model)).model
-        found.append(_Tuned(mode, parameter, factor, steady_filters(own), probabilities))
-    return found
-
-
-def _scaling(
-    mode: str, parameter: str, factor: float
-) -> Callable[[JumpMarkovModel], JumpMarkovModel]:
-    def change(model: JumpMarkovModel) -> JumpMarkovModel:
-        if not parameter:
-            return model
-        j = model.mode_names.index(mode)
-        scaled = getattr(model, parameter).copy()
-        scaled[..., j, :, :] *= factor
-        return model._replace(**{parameter: scaled})
-
-    return change
-
-
-def _tuning(
-    tuned: Sequence[_Tuned], switch: Switch, names: tuple[str, ...]
-) -> list[dict[str, Any]]:
-    """The first term of eq. 21 and the delay of a switch, tuning by tuning of its two modes."""
-    found = []
-    new, left = names.index(switch.to_mode), names.index(switch.from_mode)
-    for one in tuned:
-        T, i = one.filters[new], one.filters[left]
-        if one.mode not in ("", switch.from_mode, switch.to_mode):
-            continue
-        if isinstance(T, SteadyFilter) and isinstance(i, SteadyFilter):
-            found.append(
-                {
-                    "mode": one.mode,
-                    "parameter": one.parameter,
-                    "factor": one.factor,
-                    "first_term": 1.0 / difference(i, T).alpha,
-                    "delay_steps": predicted_delay(one.probabilities, new, switch),
-                }
-            )
-    return found
-
-
-def concordance(terms: Sequence[float], delays: Sequence[float]) -> float | None:
-    """Pairs of tunings that the smaller term makes sooner, less those it makes later, over both.
-
-    1 where a smaller term always comes with a shorter delay, -1 with a longer one (Goodman and
-    Kruskal's gamma); None where all delays are alike.
-    """
-    sooner = later = 0
-    for a in range(len(terms)):
-        for b in range(a):
-            if delays[a] != delays[b] and not math.isclose(terms[a], terms[b], rel_tol=1e-9):
-                same = (terms[a] < terms[b]) == (delays[a] < delays[b])
-                sooner, later = sooner + same, later + (not same)
-    return (sooner - later) / (sooner + later) if sooner + later else None
-
-
-# ---- pairs of modes --------------------------------------------------------------------------
-
-
-def _pairs(
-    filters: list[SteadyFilter | NoSteadyState],
-    model: JumpMarkovModel,
-    states: Mapping[tuple[str, str], Array],
-    rows: Sequence[Mapping[str, Any]],
-    settings: Settings,
-) -> list[dict[str, Any]]:
-    """Which direction is the easier one, and what is left in the long run, per ordered pair."""
-    found = []
-    for left, name in enumerate(model.mode_names):
-        for new, other in enumerate(model.mode_names):
-            if left != new:
-                row: dict[str, Any] = {"from_mode": name, "to_mode": other}
-                i, T = filters[left], filters[new]
-                lost = [one.reason for one in (i, T) if isinstance(one, NoSteadyState)]
-                if isinstance(i, SteadyFilter) and isinstance(T, SteadyFilter):
-                    d = difference(i, T)
-                    row |= {"first_term": 1.0 / d.alpha, "second_term": d.condition_number}
-                    row |= _third_terms(rows, name, other)
-                    row |= _equalities(d)
-                    state = states.get((name, other), model.initial_mean)
-                    row |= _in_the_long_run(i, T, d, state, model.transition_matrix[0], left, new)
-                else:
-                    row["steady_state"] = f"premise fails: {lost[0]}"
-                found.append(row)
-    return found
-
-
-def _third_terms(rows: Sequence[Mapping[str, Any]], left: str, new: str) -> dict[str, Any]:
-    """||e_T||/||e_i|| at the first switch of this kind, by estimator."""
-    found: dict[str, Any] = {}
-    for row in rows:
-        if (row["from_mode"], row["to_mode"]) == (left, new) and row["third_term"] is not None:
-            found.setdefault(f"third_term_{row['estimator']}", row["third_term"])
-    return found
-
-
-def _equalities(d: Difference) -> dict[str, Any]:
-    """Hwang 2006, section 4.1: the five that make two modes one to a filter, each by its norm."""
-    norms = {
-        "G_x_norm": d.G_x,
-        "H_x_norm": d.H_x,
-        "G_u_norm": d.G_u,
-        "H_u_norm": d.H_u,
-        "input_difference_norm": d.input_difference,
-    }
-    found: dict[str, Any] = {name: float(np.linalg.norm(part)) for name, part in norms.items()}
-    return found | {"means_indistinguishable": all(value < 1e-12 for value in found.values())}
-
-
-def _in_the_long_run(
-    i: SteadyFilter,
-    T: SteadyFilter,
-    d: Difference,
-    state: Array,
-    transition: Array,
-    left: int,
-    new: int,
-) -> dict[str, Any]:
-    """The steady mean residual of the wrong filter, and condition 15 with it."""
-    steady = steady_residual(i, T, state)
-    norms = [
-        None if part is None else float(np.linalg.norm(part))
-        for part in (steady.formula, steady.settled)
-    ]
-    condition = None
-    if norms[1] is not None:
-        with np.errstate(divide="ignore"):
-            ln_mu = np.log(transition[new, new]) - np.log(transition[new, left])
-        beta = (d.log_determinants + 2.0 * ln_mu) / d.largest_information
-        condition = bool(d.alpha * norms[1] ** 2 + beta > 0)
-    return {
-        "steady_residual_m": norms[0],
-        "settled_residual_m": norms[1],
-        "steady_state": steady.reason or "settles",
-        "condition_15": condition,
-    }
 
 
 ANALYSIS = Analysis(

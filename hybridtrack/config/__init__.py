@@ -6,7 +6,7 @@ from pathlib import Path
 from hybridtrack.compiled import PACKAGE
 from hybridtrack.config.build import build
 from hybridtrack.config.checks import nearest
-from hybridtrack.config.reader import Document, ScenarioError, read
+from hybridtrack.config.reader import Document, Keys, ScenarioError, read
 from hybridtrack.config.schema import json_schema
 from hybridtrack.config.validate import validate
 from hybridtrack.config.writer import dump
@@ -23,6 +23,7 @@ __all__ = [
     "find",
     "json_schema",
     "load",
+    "located",
     "nearest",
     "read",
     "shipped",
@@ -54,6 +55,14 @@ def find(config: str) -> Path:
             f"{nearest(config, tuple(shipped()))}"
         )
     return path
+
+
+def located(config: str, settings: Sequence[str], keys: Keys, sentence: str) -> ScenarioError:
+    """An error about what `keys` lead to in a scenario, with file, line and column in front."""
+    document = read(find(config))
+    for setting in settings:
+        document = document.with_setting(setting)
+    return document.error(keys, sentence)
 
 
 def load(config: str | Path, settings: Sequence[str] = ()) -> Experiment:

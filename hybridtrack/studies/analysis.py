@@ -175,6 +175,8 @@ def _interval(claim: AnalysisClaim, where: Mapping[str, Any], table: Table) -> I
             f"{_words(where, None) or 'nothing asked for'}; 'where' has to tell one"
         )
     row, name = rows[0], claim.figure
+    if isinstance(row[name], str):
+        raise UserError(f"{claim.place}: '{name}' is a text ({row[name]}); name a figure")
     value = math.nan if row[name] is None else float(row[name])
     error = row.get(f"{name}_standard_error")
     if f"{name}_low" in row and row[f"{name}_low"] is not None:
