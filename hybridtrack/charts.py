@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hybridtrack.analyses import Chart, Panel
 from hybridtrack.page import COLOURS, DASHES, TRUTH_COLOUR, finish, panels, plain, style
@@ -31,6 +32,8 @@ def _draw(chart: Chart, title: str) -> Figure:
     for ax, panel in zip(axes, chart.panels, strict=True):
         _draw_panel(ax, panel, place, marks)
     axes[-1].set_xlabel(plain(chart.x_label, 60))
+    if chart.x_label.startswith(("step", "scan")):
+        axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     finish(figure, title, chart.caption, [])
     return figure
 

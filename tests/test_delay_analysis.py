@@ -87,7 +87,7 @@ def test_filters_without_a_steady_state_say_why():
     assert isinstance(first, NoSteadyState)
     assert "no process noise" in first.reason
     assert isinstance(second, NoSteadyState)
-    assert "never measured" in second.reason
+    assert "its measurements never show" in second.reason
 
 
 @pytest.mark.parametrize("seed", range(6))

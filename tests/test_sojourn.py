@@ -9,6 +9,7 @@ from scipy.stats import ortho_group
 
 import reference_sojourn as slow
 from hybridtrack.analyses._eigenstructure import (
+    clusters,
     eigenstructure,
     power_bound,
     steps_until_below,
@@ -434,6 +435,16 @@ def test_filters_are_what_the_riccati_recursion_settles_at(model):
         )
         np.testing.assert_allclose(one.gain, K, rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(one.transition, F, rtol=1e-7, atol=1e-9)
+
+
+def test_exact_jordan_blocks_leave_other_eigenvalues_alone():
+    """Two integrators beside zeros, as the motion model that zeroes its acceleration has them."""
+    A = figure_5_model().state_transition[0, 0]
+    found = sorted((round(c.eigenvalue.real, 6), c.members) for c in clusters(A))
+    assert found == [(0.0, 2), (1.0, 4)]
+    assert sorted(z.real for z in lost_eigenvalues(A, np.zeros((6, 0)))) == pytest.approx([0, 1])
+    apart = np.diag([1.0, 1.0, 0.99]) + np.diag([1.0, 0.0], 1)
+    assert sorted(c.members for c in clusters(apart)) == [1, 2]
 
 
 def test_lost_eigenvalues_by_kalmans_rank():

@@ -16,6 +16,7 @@ from hybridtrack.models import Array
 ComplexArray = NDArray[np.complex128]
 
 SAME = 1e-6  # eigenvalues this close, relative to the largest, are one
+LARGEST_BLOCK = 4  # that is looked for: no motion model has more integrators to an axis
 ERROR = 1e-14  # of a well-conditioned eigenvalue, relative to the matrix: some 50 roundings
 
 
@@ -56,7 +57,10 @@ def clusters(matrix: Array) -> list[Cluster]:
     balanced, _ = _balanced(matrix)
     eigenvalues, left, right = eig(balanced, left=True, right=True)
     cosine = np.abs(np.einsum("ij,ij->j", left.conj(), right))
-    error = ERROR * float(np.linalg.norm(balanced, 2)) / np.maximum(cosine, ERROR)
+    # At a Jordan block the cosine is 0, and an error e moves its eigenvalues by e^(1/size).
+    most = ERROR ** (1.0 / min(len(matrix), LARGEST_BLOCK))
+    relative = np.minimum(ERROR / np.maximum(cosine, ERROR), most)
+    error = float(np.linalg.norm(balanced, 2)) * relative
     same = SAME * float(np.abs(eigenvalues).max())
     waiting, found = list(range(len(eigenvalues))), []
     while waiting:

@@ -41,9 +41,24 @@ def _predictor_filter(model: JumpMarkovModel, j: int) -> PredictorFilter:
     mode = model.mode_names[j]
     A, Q = model.state_transition[0, j], model.process_noise_covariance[0, j]
     C, R = model.measurement_matrix[j], model.measurement_noise_covariance[j]
-    root = thin_square_root(Q)
+    P = settled_covariance(model, j)
+    K: Array = np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T).T
+    observable = not lost_eigenvalues(A.T, C.T)
+    controllable = not lost_eigenvalues(A, thin_square_root(Q))
+    return PredictorFilter(mode, K, A - K @ C, observable, controllable)
+
+
+def settled_covariance(model: JumpMarkovModel, j: int) -> Array:
+    """P(k|k-1) (n_x, n_x) of mode j's filter in its steady state; model with n_times = 1.
+
+    The stabilising solution of P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q, by scipy's
+    solve_discrete_are. Raises Unsuited as `predictor_filters` does.
+    """
+    mode = model.mode_names[j]
+    A, Q = model.state_transition[0, j], model.process_noise_covariance[0, j]
+    C, R = model.measurement_matrix[j], model.measurement_noise_covariance[j]
     unobservable = lost_eigenvalues(A.T, C.T)
-    uncontrollable = lost_eigenvalues(A, root)
+    uncontrollable = lost_eigenvalues(A, thin_square_root(Q))
     for eigenvalue in unobservable:
         if abs(eigenvalue) >= 1.0 - CIRCLE:
             raise Unsuited(
@@ -62,11 +77,10 @@ def _predictor_filter(model: JumpMarkovModel, j: int) -> PredictorFilter:
                 "modes",
                 mode,
             )
-    K = _gain(mode, A, Q, C, R)
-    return PredictorFilter(mode, K, A - K @ C, not unobservable, not uncontrollable)
+    return _solved(mode, A, Q, C, R)
 
 
-def _gain(mode: str, A: Array, Q: Array, C: Array, R: Array) -> Array:
+def _solved(mode: str, A: Array, Q: Array, C: Array, R: Array) -> Array:
     from scipy.linalg import LinAlgError, LinAlgWarning, solve_discrete_are
 
     try:
@@ -75,7 +89,8 @@ def _gain(mode: str, A: Array, Q: Array, C: Array, R: Array) -> Array:
             # In units of the measurements' noise: the solver is sensitive to the scale of Q and R.
             unit = float(np.trace(R)) / len(R)
             P = unit * solve_discrete_are(A.T, C.T, Q / unit, R / unit)
-        K: Array = np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T).T
+        P = (P + P.T) / 2
+        K = np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T).T
         settled = (A - K @ C) @ P @ A.T + Q
         wrong = np.abs(settled - P).max() > RESIDUAL * max(np.abs(P).max(), np.abs(Q).max())
         rate = np.abs(np.linalg.eigvals(A - K @ C)).max()
@@ -88,7 +103,7 @@ def _gain(mode: str, A: Array, Q: Array, C: Array, R: Array) -> Array:
             "modes",
             mode,
         )
-    return K
+    return np.asarray(P, dtype=float)
 
 
 def lost_eigenvalues(A: Array, B: Array) -> tuple[complex, ...]:

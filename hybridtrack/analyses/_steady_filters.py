@@ -5,15 +5,13 @@ Balakrishnan, Tomlin 2006, section 4. What an input does is a vector b = B u her
 in u alone differ in b.
 """
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
 
+from hybridtrack.analyses._predictor_filters import settled_covariance
+from hybridtrack.errors import Unsuited
 from hybridtrack.models import Array, JumpMarkovModel
-
-STABLE = 1e-9  # a filter whose errors decay by less per step keeps them
-RESIDUAL = 1e-6  # of the Riccati equation, relative: beyond it, the solver's answer is none
 
 
 class SteadyFilter(NamedTuple):
@@ -46,43 +44,19 @@ class NoSteadyState(NamedTuple):
 
 
 def steady_filters(model: JumpMarkovModel) -> list[SteadyFilter | NoSteadyState]:
-    """The filter of each mode of a model with steps of one length.
-
-    P = A P A' - A P C' S^-1 C P A' + Q, by scipy's solve_discrete_are.
-    """
+    """The filter of each mode of a model with steps of one length."""
     return [_steady_filter(model, j) for j in range(len(model.mode_names))]
 
 
 def _steady_filter(model: JumpMarkovModel, j: int) -> SteadyFilter | NoSteadyState:
-    from scipy.linalg import solve_discrete_are
-
-    A, Q = model.state_transition[0, j], model.process_noise_covariance[0, j]
-    C, R = model.measurement_matrix[j], model.measurement_noise_covariance[j]
-    name = model.mode_names[j]
+    name, A, C = model.mode_names[j], model.state_transition[0, j], model.measurement_matrix[j]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of bad conditions: the residual tells
-            P = solve_discrete_are(A.T, C.T, Q, R)
-    except (np.linalg.LinAlgError, ValueError):
-        return NoSteadyState(name, _why(A, C))
-    P = (P + P.T) / 2
-    S = C @ P @ C.T + R
-    K = np.linalg.solve(S, C @ P).T
-    left = A @ (P - K @ C @ P) @ A.T + Q - P
-    solved = np.abs(left).max() <= RESIDUAL * max(np.abs(P).max(), np.abs(Q).max())
-    if not solved or np.abs(np.linalg.eigvals(A - K @ C @ A)).max() > 1.0 - STABLE:
-        return NoSteadyState(name, _why(A, C))
-    return SteadyFilter(name, A, model.input_effect[0, j], C, K, S, P)
-
-
-def _why(A: Array, C: Array) -> str:
-    """What is in the way: a part that isn't seen, or one that no noise drives."""
-    for eigenvalue in np.linalg.eigvals(A):
-        if abs(eigenvalue) >= 1 - 1e-9:
-            seen = np.vstack([eigenvalue * np.eye(len(A)) - A, C])
-            if np.linalg.matrix_rank(seen, tol=1e-9 * max(np.abs(A).max(), 1.0)) < len(A):
-                return "a part of the state that does not decay is never measured"
-    return "a part of the state that does not decay has no process noise, so its gain goes to 0"
+        P = settled_covariance(model, j)
+    except Unsuited as error:
+        return NoSteadyState(name, str(error))
+    S = C @ P @ C.T + model.measurement_noise_covariance[j]
+    gain = np.linalg.solve(S, C @ P).T
+    return SteadyFilter(name, A, model.input_effect[0, j], C, gain, S, P)
 
 
 class Difference(NamedTuple):

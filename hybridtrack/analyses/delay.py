@@ -260,7 +260,7 @@ def _steady_bank(
     filters = []
     for one in steady_filters(own):
         if isinstance(one, NoSteadyState):
-            return f"the filter of {one.name} has no steady state: {one.reason}"
+            return one.reason
         filters.append(one)
     mean, _, used = start(experiment, course, chosen)
     mixing = chosen.estimator.name == "imm"
