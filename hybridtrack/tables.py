@@ -216,6 +216,8 @@ def _delays(rows: Rows, summary: Rows) -> Iterator[RenderableType]:
         own = (cells.get((label, *switch), "") for switch in switches)
         table.add_row(Text(label), *own, false.get(label, ""))
     yield table
+    if any("%" in cell for cell in cells.values()):
+        yield Text("median; in brackets the share of switches that are missed")
     if any("*" in cell for cell in cells.values()):
         yield Text(
             f"*: in over {MOST_ALREADY:.0%} of the runs the estimate was so before the switch"
@@ -233,7 +235,7 @@ def delay(row: Mapping[str, Any]) -> str:
     else:
         median = row["median_delay_steps"]
         text = "never" if math.isinf(median) else f"{median:.0f}"
-        text += f", {row['missed_share']:.0%} missed" if row["missed_share"] >= 0.005 else ""
+        text += f" ({row['missed_share']:.0%})" if row["missed_share"] >= 0.005 else ""
     return text + "*" * bool(row["already_share"] > MOST_ALREADY)
 
 

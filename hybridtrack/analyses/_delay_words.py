@@ -57,7 +57,7 @@ def _measured(row: Row) -> str:
     if row["averaged_delay_steps"] is None:
         median, missed = row["median_delay_steps"], row["missed_share"]
         text = "never" if math.isinf(median) else f"{median:.0f}"
-        return text + f", {missed:.0%} missed" * bool(missed >= 0.005) + star
+        return text + f" ({missed:.0%} missed)" * bool(missed >= 0.005) + star
     low, high = row["averaged_delay_steps_low"], row["averaged_delay_steps_high"]
     text = str(row["averaged_delay"])
     return text + (f" ({_plain(low)}-{_plain(high)})" if low != high else "") + star
