@@ -50,13 +50,15 @@ def rows(table: Table) -> list[dict[str, Any]]:
 
 
 def finite(value: Any) -> Any:
-    """The same for JSON: NaN and infinity are null."""
+    """The same for JSON, which has neither: NaN is null, infinity (never) the text "inf"."""
     if isinstance(value, Mapping):
         return {str(key): finite(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
         return [finite(part) for part in value]
     value = _plain(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def prepare(folder: Path, digest: str) -> None:

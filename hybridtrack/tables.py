@@ -36,6 +36,7 @@ MOST_DECIMALS = 6  # more than that, and figures of a million on, take an expone
 MOST_DIGITS = 6  # of a figure with an exponent, after its point
 SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
 WIDEST = 10_000
+LONG_TEXT = 40  # letters of a cell, beyond which it has several lines
 MOST_SENTENCES = 4  # of theory
 MOST_SWITCHES = 6  # whose delays are printed
 VERDICT_STYLES = {
@@ -101,14 +102,10 @@ def _print(parts: Iterable[RenderableType], console: Console) -> None:
 
 def _parts_of(record: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield Text(f"{record['title']}: {record['summary']}\n")
-    if record["shown"]:
-        table = _plain_table()
-        for i, heading in enumerate(record["shown"]):
-            justify: Literal["left", "right"] = "left" if i == 0 else "right"
-            table.add_column(Text(heading), justify=justify, overflow="fold", no_wrap=i > 0)
-        for cells in zip(*record["shown"].values(), strict=True):
-            table.add_row(*map(Text, cells))
-        yield table
+    for one in record["shown"]:
+        if one["name"]:
+            yield Text(f"{one['name'].replace('_', ' ')}:")
+        yield _as_shown(one["columns"])
         yield ""
     for sentence in record["conclusions"]:
         yield Text(sentence)
@@ -118,6 +115,24 @@ def _parts_of(record: Mapping[str, Any]) -> Iterator[RenderableType]:
     if record["published"]:
         yield ""
         yield _published(record["published"])
+
+
+def _as_shown(columns: Mapping[str, list[str]]) -> Table:
+    """Texts by heading; the first column is a name's, and long texts are folded."""
+    table = _plain_table()
+    for i, (heading, cells) in enumerate(columns.items()):
+        long = max(map(len, cells), default=0) > LONG_TEXT
+        justify: Literal["left", "right"] = "left" if i == 0 or long else "right"
+        table.add_column(
+            Text(heading),
+            justify=justify,
+            overflow="fold",
+            no_wrap=i > 0 and not long,
+            max_width=LONG_TEXT if long else None,
+        )
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*map(Text, row))
+    return table
 
 
 def _hanging(note: str) -> Table:

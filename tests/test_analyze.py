@@ -113,7 +113,8 @@ def test_json_is_alone_on_stdout_and_has_no_infinity(finished):
     assert done.stderr == ""
     record = json.loads(done.stdout, parse_constant=pytest.fail)
     assert record["analysis"] == "delay"
-    assert record["table"][0]["proposition_4_3_delay_steps"] is None
+    assert record["table"][0]["proposition_4_3_delay_steps"] == "inf"
+    assert record["table"][0]["proposition_4_2_condition_2_delay_steps"] is None
     assert record["table"][0]["proposition_4_3_result"] == "never satisfied"
 
 
@@ -372,7 +373,7 @@ def test_columns_keep_their_types(tmp_path):
     assert kinds["b"] == kinds["e"] == kinds["f"] == "float64"
     assert kinds["g"] == "int64"
     assert table.e.tolist()[:2] == [1.0, math.inf]
-    assert record["table"][1]["e"] is None
+    assert [row["e"] for row in record["table"]] == [1.0, "inf", None]
     assert record["table"][0]["d"] is True
 
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,10 @@ def analyse(
         "settings": settings._asdict(),
         "run": None if run is None else str(run),
         "table": dossiers.rows(findings.table),
-        "shown": {heading: list(cells) for heading, cells in findings.table.shown.items()},
+        "shown": [
+            {"name": name, "columns": {heading: list(cells) for heading, cells in shown.items()}}
+            for name, shown in _shown_tables(findings)
+        ],
         "tables": {name: dossiers.rows(table) for name, table in findings.tables.items()},
         "conclusions": list(findings.conclusions),
         "notes": [*findings.notes, *(f"assumed: {text}" for text in experiment.assumptions)],
@@ -92,6 +95,13 @@ def analyse(
     }
     dossiers.finish(folder, record)
     return dict(dossiers.finite(record))
+
+
+def _shown_tables(findings: Findings) -> Iterator[tuple[str, Mapping[str, Sequence[str]]]]:
+    """What is printed: the main table, then those of the others that show something, by name."""
+    for name, table in {"": findings.table, **findings.tables}.items():
+        if table.shown:
+            yield name, table.shown
 
 
 # ---- published figures -----------------------------------------------------------------------
