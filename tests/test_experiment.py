@@ -23,7 +23,14 @@ from hybridtrack.results import (
     read_manifest,
     require_complete,
 )
-from hybridtrack.statistics import METRICS, RunSums, compare, pair_moments, ratio_of_sums
+from hybridtrack.statistics import (
+    FALSE_SWITCHES,
+    METRICS,
+    RunSums,
+    compare,
+    pair_moments,
+    ratio_of_sums,
+)
 from models import RANDOM, SMALL, read_table, scenario
 
 TABLES = ("summary", "steps", "runs", "tracks", "comparisons", "published", "reliability")
@@ -354,7 +361,9 @@ def test_summary_equals_recomputation_from_runs(tmp_path, text):
             assert row.standard_error == pytest.approx(error, rel=1e-9, abs=1e-12)  # differences
             assert row.n_runs == 300
             rows += 1
-    assert rows == len(summary)
+    false = summary[summary.metric == FALSE_SWITCHES]  # of all steps, and of no sum of a run
+    assert list(false.estimator) == ["IMM"]
+    assert rows + len(false) == len(summary)
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "a" / "summary.csv"), summary)
 
 

@@ -39,9 +39,11 @@ def tuned(
         return []
     found = []
     changes: list[tuple[str, str, float]] = [("", "", 1.0)]
+    moving = {name for switch in course.switches for name in (switch.from_mode, switch.to_mode)}
     changes += [
         (mode, parameter, factor)
         for mode in model.mode_names
+        if mode in moving
         for parameter in ("process_noise_covariance", "measurement_noise_covariance")
         for factor in FACTORS
     ]

@@ -286,11 +286,12 @@ def _bounded(
         bank = "the truth has not all of the filters' states"
     elif isinstance(bank, _SteadyBank) and bank.estimate(switch.step - 1) != left:
         bank = f"without noise the bank does not estimate {switch.from_mode} before the switch"
+    fails = f"premise fails: {bank}" if isinstance(bank, str) else None
     against: Rival | None = None
     for suffix, as_printed in versions.items():
         for name in CONDITIONS:
             row[f"{name}{suffix}_delay_steps"] = None
-            row[f"{name}{suffix}_result"] = None if bank is None else f"premise fails: {bank}"
+            row[f"{name}{suffix}_result"] = fails
         if isinstance(bank, _SteadyBank) and truth is not None:
             transition = model.transition_matrix[0]
             others = [j for j in range(len(names)) if j != new]
