@@ -362,7 +362,8 @@ def test_summary_equals_recomputation_from_runs(tmp_path, text):
             assert row.n_runs == 300
             rows += 1
     false = summary[summary.metric == FALSE_SWITCHES]  # of all steps, and of no sum of a run
-    assert list(false.estimator) == ["IMM"]
+    assert "IMM" in set(false.estimator)
+    assert set(false.window) == {"all"}
     assert rows + len(false) == len(summary)
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "a" / "summary.csv"), summary)
 
