@@ -26,6 +26,7 @@ NOTES = (
     "tuning_concordance: 1 where a smaller first term of (21) always comes with a shorter delay, "
     "-1 with a longer one, over noises of a quarter to four times, one at a time (tuning.parquet)",
 )
+THIRD = "third_term_"
 BOUNDS = tuple(f"proposition_4_{name}" for name in ("2", "3", "4"))
 
 
@@ -98,6 +99,24 @@ def _bound(row: Row, keys: Sequence[str]) -> str:
     if not delays:
         return "–"
     return "no" if math.isinf(min(delays)) else f"{min(delays):.0f}"
+
+
+def shown_pairs(pairs: Sequence[Row]) -> dict[str, list[str]]:
+    """What a terminal shows of ordered pairs: the terms of eq. 21, and the residual in the end."""
+    third = [key for key in dict.fromkeys(k for p in pairs for k in p) if key.startswith(THIRD)]
+    columns = {"from": "from_mode", "to": "to_mode", "first\nterm": "first_term"}
+    columns |= {"second": "second_term"}
+    columns |= {f"third,\n{key.removeprefix(THIRD)}": key for key in third}
+    columns |= {"residual\nleft, m": "settled_residual_m", "(15)": "condition_15"}
+    return {heading: [_cell(pair.get(key)) for pair in pairs] for heading, key in columns.items()}
+
+
+def _cell(value: Any) -> str:
+    if value is None or value != value:
+        return "–"
+    if isinstance(value, bool):
+        return "met" if value else "not met"
+    return value if isinstance(value, str) else "∞" if math.isinf(value) else f"{value:.3g}"
 
 
 # ---- conclusions -----------------------------------------------------------------------------
@@ -222,7 +241,8 @@ def _which_direction(rows: Sequence[Row], pairs: Sequence[Row]) -> list[str]:
                 f", {agree}: {_plain_or_never(there)} against {_plain_or_never(other)} steps"
             )
         sums = [
-            _median(rows, modes, lambda row: row["sum_of_logarithms"]) for modes in ((a, b), (b, a))
+            _median(rows, modes, lambda row: _finite(row["sum_of_logarithms"]))
+            for modes in ((a, b), (b, a))
         ]
         if sums[0] is not None and sums[1] is not None and sums[0] > sums[1]:
             sentence += (
@@ -231,6 +251,10 @@ def _which_direction(rows: Sequence[Row], pairs: Sequence[Row]) -> list[str]:
             )
         said.append(sentence + ".")
     return said[:3]
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else value
 
 
 def _plain_or_never(delay: float) -> str:

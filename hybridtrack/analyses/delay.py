@@ -14,7 +14,7 @@ import numpy as np
 
 from hybridtrack.analyses import Analysis, Findings, Measured, Table, model_at_one_step
 from hybridtrack.analyses import _delay_charts as charts
-from hybridtrack.analyses._delay_words import NOTES, conclusions, shown
+from hybridtrack.analyses._delay_words import NOTES, conclusions, shown, shown_pairs
 from hybridtrack.analyses._directions import pairs_of_modes
 from hybridtrack.analyses._mean_course import (
     BEFORE,
@@ -151,7 +151,10 @@ def _analyse(experiment: Experiment, settings: Settings, measured: Measured | No
         table=table._replace(shown=shown(rows)),
         conclusions=conclusions(rows, pairs, measured.runs),
         notes=(*notes, *_limits(experiment), *NOTES),
-        tables={"pairs": _table(pairs), "tuning": _table(tunings)},
+        tables={
+            "pairs": _table(pairs)._replace(shown=shown_pairs(pairs)),
+            "tuning": _table(tunings),
+        },
         charts=charts.charts(experiment, measured, predictions, rows),
     )
 
