@@ -113,6 +113,15 @@ def test_floor_and_ceiling_of_the_reference_case(reference_case):
     assert bare["share_broken"] > 0.9  # so it is no ceiling at all
     assert row(eigenvalues, bound="ceiling given the spread")["share_broken"] == 0.0
     assert (floor["steps_checked"], floor["steps_broken"]) == (4991, 0)
+    assert floor["bound_from_step"] == 202
+
+
+def test_a_floor_is_due_from_the_first_measurements_on():
+    """beta_1(2) bounds what two measurements gave, and 200 iterations later it has settled."""
+    bank = _riccati.bank(model_of("stability_cv_ct"))
+    low = _riccati.floor(bank, _riccati.all_sequences(bank, 3))
+    assert (low.first, len(low.path), low.from_step) == (2, 201, 202)
+    np.testing.assert_array_equal(low.at(np.array([2, 202, 999])), low.path[[0, -1, -1]])
 
 
 def test_the_simulation_of_the_reference_case():
@@ -424,6 +433,8 @@ def test_meet_and_join_of_numbers_and_of_singular_matrices():
 def test_numerical_rank():
     assert is_singular(np.diag([1.0, 0.0]))
     assert not is_singular(np.array([[1.0, 10.0], [0.0, 1.0]]))
+    assert not is_singular(np.array([[1.0, 3e8], [0.0, 1.0]]))  # a clock's drift, in metres
+    assert is_singular(np.array([[1.0, 3e8, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]]))
     assert is_definite(np.diag([1e9, 1e-9]))  # units don't matter
     assert not is_definite(np.outer([1.0, 2.0], [1.0, 2.0]))
     assert not is_definite(np.diag([1.0, 0.0]))
@@ -497,6 +508,33 @@ def test_iterations_that_go_round_are_held_and_grow_weaker():
     for j in range(3):
         assert _riccati.below(held.matrix, _riccati.updated(bank, j, held.matrix))
     assert np.trace(held.matrix) <= np.trace(free.matrix) * (1 + 1e-9)
+
+
+def test_a_floor_that_outgrows_all_numbers_is_beta_1(tmp_path):
+    """Nothing is seen, and all grows: the iteration is given up, and says why."""
+    unseen = [
+        change
+        for mode in ("slow", "fast")
+        for change in (
+            f"modes.{mode}.state_transition=[[1.5, 0.5], [0, 1.2]]",
+            f"modes.{mode}.measurement_matrix=[[0, 0]]",
+        )
+    ]
+    unseen.append("modes.slow.measurement_noise_covariance=[[9]]")
+    found = analyse(scenario(tmp_path, CHAIN, *unseen))
+    note = next(note for note in found.notes if note.startswith("the floor is valid, but "))
+    assert "given up: it grew beyond 1e+24 within" in note
+    assert note.endswith("steps; it is beta_1 I instead, of N = 10")
+
+
+def test_a_ceiling_begins_above_the_start():
+    """The start is the largest of all covariances here."""
+    model = model_of("stability_cv_ct")
+    start = 1e8 * np.eye(4)
+    high = _riccati.ceiling(_riccati.bank(model), np.zeros((4, 4)), start)
+    assert high.first == 0
+    assert_below(start, high.path[0])
+    assert np.trace(high.path[0]) > 2 * np.trace(start)
 
 
 def test_a_larger_spread_has_a_higher_ceiling():
