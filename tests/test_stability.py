@@ -12,7 +12,7 @@ from hybridtrack.analyses import _mixing, _riccati
 from hybridtrack.analyses import stability as room
 from hybridtrack.analyses._definite import is_definite, is_singular, join, meet, square_root
 from hybridtrack.analyses._examination import checks, examine
-from hybridtrack.analyses._stability_words import verdict
+from hybridtrack.analyses._stability_words import no_rate, verdict
 from hybridtrack.analyses.stability import ANALYSIS, findings, longest_sequence
 from hybridtrack.config import load
 from hybridtrack.errors import UserError
@@ -693,6 +693,103 @@ def test_a_rate_and_its_error():
     assert abs(per_step.mean() - np.exp(-0.1)) < 4 * true_error / np.sqrt(200)
     assert _mixing.simulated_rate(np.array([0.0])) is None
     assert _mixing.simulated_rate(np.array([0.0, -np.inf])).per_step == 0.0
+
+
+def test_the_first_tenth_says_nothing_of_a_rate():
+    """Errors that grow at first, and then fall by a tenth of their logarithm per step."""
+    logs = np.concatenate([0.3 * np.arange(20), 5.7 - 0.1 * np.arange(1, 182)])
+    rate = _mixing.simulated_rate(logs)
+    assert rate.from_step == 20
+    assert rate.per_step == pytest.approx(np.exp(-0.1), rel=1e-12)
+    assert rate.known
+
+
+def test_a_pace_that_drifts_is_no_rate():
+    """Powers of k, and a change halfway; chance alone hardly ever looks so (none of 2,000)."""
+    k = np.arange(1001.0)
+    assert _mixing.simulated_rate(-np.log1p(k)).trend == "rising"
+    assert _mixing.simulated_rate(-1e-4 * k**1.5).trend == "falling"
+    assert not _mixing.simulated_rate(-np.log1p(k)).known
+    assert _mixing.simulated_rate(-0.1 * k - 1e-6 * k**2).trend == "none"  # by 2 % of itself
+    rng = np.random.default_rng(7)
+    steady = np.cumsum(-0.1 + 0.5 * rng.normal(size=(2000, 1001)), axis=1)
+    assert all(_mixing.simulated_rate(logs).known for logs in steady)
+    drifting = _mixing.simulated_rate(-3 * np.log1p(k) + 0.01 * rng.normal(size=1001))
+    assert drifting.trend == "rising"
+
+
+def test_errors_that_die_as_one_over_k_have_no_time_constant():
+    """A constant without noise: its filter averages, however long."""
+    for steps in (500, 2000):
+        found = analyse(load("observability_scalar", [f"analyses.stability.steps={steps}"]))
+        assert found.conclusions[0].endswith("errors die away, but slower and slower: no rate.")
+        simulated = row(found.tables["rates"], kind="simulated")
+        assert (simulated["rate_per_step"], simulated["time_constant_steps"]) == (None, None)
+        assert "slower and slower" in simulated["because"]
+        assert set(found.table.columns["simulated_rate_per_step"]) == {None}
+        labels = [line.label for line in found.charts[1].panels[0].lines]
+        assert not any(label.startswith("simulated rate") for label in labels)
+
+
+def test_a_simulation_may_be_too_short_for_a_rate(tmp_path):
+    found = analyse(load("stability_cv_ct", ["analyses.stability.steps=100"]))
+    assert "the simulation of 100 steps is too short for a rate." in found.conclusions[0]
+    away = "modes.fast.state_transition=[[1.5, 0.5], [0, 2]]"
+    found = analyse(scenario(tmp_path, CHAIN, away))
+    assert "of its 5,000 steps, too short for a rate." in found.conclusions[0]
+    assert row(found.tables["rates"], kind="simulated")["rate_per_step"] is None
+
+
+def paced(trend, *halves):
+    """The words for a simulation of 200 steps whose halves go at these paces."""
+    found = examine(model_of("stability_cv_ct"), 2, 200, 1)
+    return no_rate(found._replace(rate=_mixing.Rate(0.9, 0.01, 20, trend, halves)))
+
+
+def test_a_pace_that_drifts_has_words():
+    assert paced("none", -0.1, -0.1) == ""
+    assert paced("rising", -0.2, -0.1).endswith("but slower and slower: no rate")
+    assert paced("falling", -0.1, -0.2).endswith("faster and faster: no rate")
+    assert "in the simulation's later half errors don't die" in paced("rising", -0.2, 0.1)
+    assert "in the later half only" in paced("falling", 0.1, -0.2)
+
+
+def test_the_bounds_that_are_drawn_are_those_due(reference_case):
+    """The settled floor of the reference case is a bound from step 202 on, beyond the figure."""
+    for panel, floor in zip(reference_case.charts[0].panels, (17.197, 0.78226) * 2, strict=True):
+        (band,) = panel.bands
+        assert band.x[0] == 2
+        assert band.low[0] < 0.2
+        assert (np.diff(band.low) >= -1e-12).all()
+        assert band.low[-1] == pytest.approx(floor, rel=1e-2)
+        for line in panel.lines:
+            assert (line.y[2:] >= band.low).all()
+            assert (line.y[2:] <= band.high).all()
+
+
+def test_a_ceiling_alone_is_drawn_as_a_reference():
+    found = analyse(load("stability_embedded_cv", ["analyses.stability.steps=200"]))
+    for panel in found.charts[0].panels:
+        assert not panel.bands
+        assert [(line.label, line.reference) for line in panel.lines] == [
+            ("CV", False),
+            ("CA", False),
+            ("ceiling", True),
+        ]
+        ceiling = panel.lines[2].y
+        assert ceiling[0] > ceiling[-1]
+        assert all((line.y <= ceiling).all() for line in panel.lines[:2])
+
+
+def test_certified_curves_hold_up_to_a_factor():
+    certified = {
+        line.label
+        for name in ("stability_cv_ct", "stability_ca")
+        for line in analyse(load(name, ["analyses.stability.steps=200"])).charts[1].panels[0].lines
+        if line.label.startswith(("certified", "one-step"))
+    }
+    assert len(certified) == 2
+    assert all(label.endswith(", up to a constant factor") for label in certified)
 
 
 def test_a_flight_is_drawn_from_the_banks_own_chain():

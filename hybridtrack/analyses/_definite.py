@@ -90,7 +90,7 @@ def is_definite(covariance: Array) -> bool:
 def is_singular(matrix: Array) -> bool:
     """Whether a square matrix (n, n), a map of states, has no inverse in numbers.
 
-    It is balanced first, since the states' units mustn't decide: seconds and metres may be 3e8 apart.
+    It is balanced first, since the states' units mustn't decide.
     """
     from scipy.linalg import matrix_balance
 

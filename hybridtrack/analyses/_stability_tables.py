@@ -11,6 +11,7 @@ from hybridtrack.analyses._riccati import Bound, Certificate
 from hybridtrack.analyses._stability_words import (
     modes,
     near_one,
+    no_rate,
     number,
     one_step_rate,
     stds,
@@ -20,7 +21,7 @@ from hybridtrack.analyses._stability_words import (
 
 def sequences(found: Stability) -> Table:
     figures = found.figures
-    simulated = found.rate.per_step if found.rate is not None else None
+    simulated = found.one_rate
     certificate = found.certificate
     certified = certificate.rate if certificate is not None else None
     short = certificate.short if certificate is not None else None
@@ -133,7 +134,9 @@ def rates(found: Stability) -> Table:
         constant = _time_constant(root, short)
         rows.append(("one step, ours", None, root, short, None, constant, True, ""))
     rate = found.rate
-    if rate is not None:
+    if rate is None or found.one_rate is None:
+        rows.append(("simulated", None, None, None, None, None, False, no_rate(found)))
+    else:
         rows.append(
             (
                 "simulated",

@@ -91,10 +91,11 @@ def verdict(found: Stability) -> str:
 def _simulated_words(found: Stability) -> str:
     steps = len(found.logs) - 1
     rate = found.rate
-    if rate is None:
-        return "nothing could be simulated"
+    missing = no_rate(found)
+    if rate is None or missing:
+        return missing
     if rate.per_step == 0.0:
-        return "in the simulation nothing at all is left of the first errors"
+        return "in the simulation nothing is left of the first errors, to double precision"
     short = 1 - rate.per_step
     error = "" if rate.standard_error is None else f" (standard error {rate.standard_error:.1g})"
     words = f"simulated rate {near_one(rate.per_step, short)}{error} per step over {steps:,} steps"
@@ -105,6 +106,30 @@ def _simulated_words(found: Stability) -> str:
             f"{constant:.3g} steps ({constant * found.step_s:.3g} s)"
         )
     return f"{words}: errors don't die away"
+
+
+def no_rate(found: Stability) -> str:
+    """Why the simulation shows no rate, in a clause; empty where it shows one."""
+    if found.one_rate is not None:
+        return ""
+    steps, rate = len(found.logs) - 1, found.rate
+    if rate is None:
+        return "nothing could be simulated"
+    if found.ended_early:
+        return (
+            f"the simulation ends after {steps:,} of its {found.steps_asked:,} steps, too short "
+            "for a rate"
+        )
+    if rate.standard_error is None:
+        return f"the simulation of {steps:,} steps is too short for a rate"
+    earlier, later = rate.halves
+    if later >= 0.0:
+        return "in the simulation's later half errors don't die away, and there is no one rate"
+    if earlier >= 0.0:
+        return "in the simulation errors die away in the later half only: no rate"
+    if rate.trend == "rising":
+        return "in the simulation errors die away, but slower and slower: no rate"
+    return "in the simulation errors die away faster and faster: no rate"
 
 
 def _certified_words(found: Stability) -> str | None:
@@ -233,7 +258,7 @@ def notes(found: Stability, checked: Checks) -> tuple[str, ...]:
         f"simulated: {steps:,} steps of a flight drawn from the bank's own chain, start and "
         "noises; eigenvalues mix the states' units, as the paper's do",
     ]
-    if steps < found.steps_asked:
+    if found.ended_early:
         said.append(
             f"the simulation ends before its {found.steps_asked:,} steps, since a state or a "
             "covariance gets too large (1e12)"
