@@ -1072,11 +1072,71 @@ def test_a_floor_that_doesnt_hold_yet_is_told(tmp_path):
 
 def test_a_given_spread_is_held_against_the_simulation():
     narrow = analyse(load("stability_cv_ct", ["analyses.stability.spread_std=[10, 1, 10, 1]"]))
-    assert any("exceeded what is given at" in note for note in narrow.notes)
+    note = next(note for note in narrow.notes if "exceeded what is given at" in note)
+    share = note[note.index(" at ") :]
+    assert narrow.conclusions[1].endswith(
+        f"rests on the spread of the means, which the simulation exceeded{share}."
+    )
+    assert f"vy 1 (given), which the simulation exceeded{share}." in narrow.conclusions[2]
     wide = analyse(load("stability_cv_ct", ["analyses.stability.spread_std=[300]"]))
     assert any("never exceeded what is given" in note for note in wide.notes)
-    assert "(given)" in wide.conclusions[2]
+    assert wide.conclusions[2].endswith("(given).")
+    assert not any("the simulation exceeded" in sentence for sentence in wide.conclusions)
     assert row(wide.tables["eigenvalues"], bound="ceiling given the spread")["steps_broken"] == 0
+
+
+def test_no_spread_is_told_once():
+    """The ceiling given a spread of 0 is the one without a spread."""
+    none = analyse(load("stability_cv_ct", ["analyses.stability.spread_std=[0]"]))
+    assert not any(sentence.startswith("Without the spread") for sentence in none.conclusions)
+    assert "(given), which the simulation exceeded at 99." in none.conclusions[2]
+    some = analyse(load("stability_cv_ct"))
+    assert some.conclusions[3].startswith("Without the spread of the modes' means")
+
+
+def test_what_could_not_be_checked_is_told():
+    """11 steps are fewer than N = 12, and than the ceiling takes to settle."""
+    changes = ["analyses.stability.steps=11", "analyses.stability.measurements=12"]
+    notes = analyse(load("stability_cv_ct", changes)).notes
+    assert "the floor isn't checked from N = 12 on: the simulation has only 11 steps" in notes
+    note = next(note for note in notes if note.startswith("the ceiling without spread, due from"))
+    assert note.endswith("on, isn't checked: the simulation has only 11 steps")
+    long = analyse(load("stability_cv_ct", ["analyses.stability.steps=200"])).notes
+    assert not any("isn't checked" in note for note in long)
+
+
+def test_a_certified_rate_is_useless_only_where_it_is():
+    """Time constants of 4 / log(1 + c_1) steps, against some 6 simulated."""
+    found = examine(model_of("stability_cv_ct"), 2, 300, 1)
+    simulated = -1 / np.log(found.rate.per_step)
+    for times, useless in ((1010, True), (990, False), (12, False)):
+        c_1 = np.expm1(4 / (times * simulated))
+        certificate = found.certificate._replace(c_1=c_1)
+        sentence = findings(found._replace(certificate=certificate)).conclusions[1]
+        assert ("valid and useless" in sentence) == useless
+        assert (f", {times} times the simulated one; this rests" in sentence) == (not useless)
+    rate = found.rate._replace(trend="rising")
+    sentence = findings(found._replace(rate=rate)).conclusions[1]
+    assert "useless" not in sentence
+    assert "times" not in sentence
+
+
+def test_a_page_has_beta_1_and_beta_2_and_few_tables(reference_case):
+    printed = {name: table.shown for name, table in reference_case.tables.items() if table.shown}
+    assert list(printed) == ["rates", "bounds", "eigenvalues"]
+    cells = printed["eigenvalues"]
+    smallest = dict(zip(cells["P_j(k|k)"], cells["smallest\neigenvalue"], strict=True))
+    largest = dict(zip(cells["P_j(k|k)"], cells["largest\neigenvalue"], strict=True))
+    assert smallest["floor (smallest: beta_1)"] == "0.3153"
+    beta_2 = largest["ceiling if spread (largest: beta_2)"]
+    assert largest["ceiling, no spread"] == "854.1"
+    assert "simulated, from step 10" in smallest
+    assert any(f"no larger: beta_2 {beta_2}, beta_3" in note for note in reference_case.notes)
+    bare = printed["bounds"]["ceiling,\nno spread"]
+    assert bare == ["29.08", "4.323", "29.08", "4.323"]
+    # Where the theorem says nothing, the ceiling still has its beta_2.
+    other = analyse(load("stability_embedded_cv", ["analyses.stability.steps=200"]))
+    assert any("no larger: beta_2 " in note and "beta_3" not in note for note in other.notes)
 
 
 def test_one_mode_is_no_imm(tmp_path):
@@ -1098,8 +1158,13 @@ def test_too_many_sequences_and_steps_are_refused():
     assert longest_sequence(100, None) == 2
     with pytest.raises(UserError, match=r"1,048,576 sequences.*'measurements'.*to 14 or less"):
         longest_sequence(2, 20)
-    with pytest.raises(UserError, match="name fewer modes"):
-        longest_sequence(200, None)
+    with pytest.raises(UserError) as refused:
+        longest_sequence(2, 20)
+    assert refused.value.keys == ("analyses", "stability", "measurements")
+    for measurements in (None, 3):
+        with pytest.raises(UserError, match="name fewer modes") as refused:
+            longest_sequence(200, measurements)
+        assert refused.value.keys == ("modes",)
     six = ["analyses.stability.steps=100000", "analyses.stability.measurements=2"]
     analyse(load("stability_ca", ["analyses.stability.steps=10"]))
     with pytest.raises(UserError, match="'spread_std' has 3 numbers for the states x vx y vy"):

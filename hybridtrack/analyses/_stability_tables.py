@@ -51,6 +51,7 @@ def sequences(found: Stability) -> Table:
 
 
 def conditions(found: Stability) -> Table:
+    """Nothing of it is shown: a note says it in a sentence."""
     asked, bank, last = found.conditions, found.bank, found.figures[-1]
     longest = asked.longest
     singular = f"A of {modes(asked.singular)} is singular" if asked.singular else ""
@@ -96,11 +97,6 @@ def conditions(found: Stability) -> Table:
             "verdict": verdicts,
             "needs_measurements": needs,
             "because": reasons,
-        },
-        {
-            "condition": names,
-            "verdict": verdicts,
-            "N": ["-" if n is None else str(n) for n in needs],
         },
     )
 
@@ -195,7 +191,7 @@ def bounds(found: Stability) -> Table:
         "simulated_smallest_std": simulated.min(axis=(0, 1)).tolist(),
         "simulated_largest_std": simulated.max(axis=(0, 1)).tolist(),
     }
-    shown = {"state": list(found.bank.states)}
+    shown = {"std of": list(found.bank.states)}
     for heading, name in {
         "floor": "floor_std",
         "smallest\nsimulated": "simulated_smallest_std",
@@ -242,7 +238,12 @@ def eigenvalues(found: Stability, checked: Checks) -> Table:
             "because": why,
         },
         {
-            "P_j(k|k)": names,
+            "P_j(k|k)": [
+                "floor (smallest: beta_1)",
+                "ceiling if spread (largest: beta_2)",
+                "ceiling, no spread",
+                f"simulated, from step {longest}",
+            ],
             "smallest\neigenvalue": [number(value) for value in smallest_],
             "largest\neigenvalue": [number(value) for value in largest_],
             "broken at\n% of steps": [
@@ -253,7 +254,10 @@ def eigenvalues(found: Stability, checked: Checks) -> Table:
 
 
 def constants(found: Stability) -> Table:
-    """The betas and c_1; None where the theorem doesn't get so far."""
+    """The betas and c_1; None where the theorem doesn't get so far.
+
+    Nothing of it is shown: beta_1 and beta_2 are among the eigenvalues, and a note has the others.
+    """
     one, printed = found.certificate, found.printed_certificate
     first = next((figures for figures in found.figures if figures.controllable), None)
     high, low = found.ceiling.matrix, found.floor.matrix
@@ -304,11 +308,6 @@ def constants(found: Stability) -> Table:
             "value": values,
             "conditional_on_spread": conditional,
             "from": sources,
-        },
-        {
-            "constant": names,
-            "value": [number(value) for value in values],
-            "if spread": ["yes" if value else "no" for value in conditional],
         },
     )
 
