@@ -763,6 +763,7 @@ def test_the_bounds_that_are_drawn_are_those_due(reference_case):
         assert (np.diff(band.low) >= -1e-12).all()
         assert band.low[-1] == pytest.approx(floor, rel=1e-2)
         for line in panel.lines:
+            assert line.y.max() <= panel.y_limits[1]
             assert (line.y[2:] >= band.low).all()
             assert (line.y[2:] <= band.high).all()
 
@@ -777,6 +778,7 @@ def test_a_ceiling_alone_is_drawn_as_a_reference():
             ("ceiling", True),
         ]
         ceiling = panel.lines[2].y
+        assert max(line.y.max() for line in panel.lines[:2]) <= panel.y_limits[1] < ceiling[0]
         assert ceiling[0] > ceiling[-1]
         assert all((line.y <= ceiling).all() for line in panel.lines[:2])
 
