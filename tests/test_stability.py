@@ -12,7 +12,7 @@ from hybridtrack.analyses import _mixing, _riccati
 from hybridtrack.analyses import stability as room
 from hybridtrack.analyses._definite import is_definite, is_singular, join, meet, square_root
 from hybridtrack.analyses._examination import checks, examine
-from hybridtrack.analyses._stability_words import verdict
+from hybridtrack.analyses._stability_words import no_rate, verdict
 from hybridtrack.analyses.stability import ANALYSIS, findings, longest_sequence
 from hybridtrack.config import load
 from hybridtrack.errors import UserError
@@ -113,6 +113,15 @@ def test_floor_and_ceiling_of_the_reference_case(reference_case):
     assert bare["share_broken"] > 0.9  # so it is no ceiling at all
     assert row(eigenvalues, bound="ceiling given the spread")["share_broken"] == 0.0
     assert (floor["steps_checked"], floor["steps_broken"]) == (4991, 0)
+    assert floor["bound_from_step"] == 202
+
+
+def test_a_floor_is_due_from_the_first_measurements_on():
+    """beta_1(2) bounds what two measurements gave, and 200 iterations later it has settled."""
+    bank = _riccati.bank(model_of("stability_cv_ct"))
+    low = _riccati.floor(bank, _riccati.all_sequences(bank, 3))
+    assert (low.first, len(low.path), low.from_step) == (2, 201, 202)
+    np.testing.assert_array_equal(low.at(np.array([2, 202, 999])), low.path[[0, -1, -1]])
 
 
 def test_the_simulation_of_the_reference_case():
@@ -424,6 +433,8 @@ def test_meet_and_join_of_numbers_and_of_singular_matrices():
 def test_numerical_rank():
     assert is_singular(np.diag([1.0, 0.0]))
     assert not is_singular(np.array([[1.0, 10.0], [0.0, 1.0]]))
+    assert not is_singular(np.array([[1.0, 3e8], [0.0, 1.0]]))  # a clock's drift, in metres
+    assert is_singular(np.array([[1.0, 3e8, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]]))
     assert is_definite(np.diag([1e9, 1e-9]))  # units don't matter
     assert not is_definite(np.outer([1.0, 2.0], [1.0, 2.0]))
     assert not is_definite(np.diag([1.0, 0.0]))
@@ -497,6 +508,33 @@ def test_iterations_that_go_round_are_held_and_grow_weaker():
     for j in range(3):
         assert _riccati.below(held.matrix, _riccati.updated(bank, j, held.matrix))
     assert np.trace(held.matrix) <= np.trace(free.matrix) * (1 + 1e-9)
+
+
+def test_a_floor_that_outgrows_all_numbers_is_beta_1(tmp_path):
+    """Nothing is seen, and all grows: the iteration is given up, and says why."""
+    unseen = [
+        change
+        for mode in ("slow", "fast")
+        for change in (
+            f"modes.{mode}.state_transition=[[1.5, 0.5], [0, 1.2]]",
+            f"modes.{mode}.measurement_matrix=[[0, 0]]",
+        )
+    ]
+    unseen.append("modes.slow.measurement_noise_covariance=[[9]]")
+    found = analyse(scenario(tmp_path, CHAIN, *unseen))
+    note = next(note for note in found.notes if note.startswith("the floor is valid, but "))
+    assert "given up: it grew beyond 1e+24 within" in note
+    assert note.endswith("steps; it is beta_1 I instead, of N = 10")
+
+
+def test_a_ceiling_begins_above_the_start():
+    """The start is the largest of all covariances here."""
+    model = model_of("stability_cv_ct")
+    start = 1e8 * np.eye(4)
+    high = _riccati.ceiling(_riccati.bank(model), np.zeros((4, 4)), start)
+    assert high.first == 0
+    assert_below(start, high.path[0])
+    assert np.trace(high.path[0]) > 2 * np.trace(start)
 
 
 def test_a_larger_spread_has_a_higher_ceiling():
@@ -655,6 +693,105 @@ def test_a_rate_and_its_error():
     assert abs(per_step.mean() - np.exp(-0.1)) < 4 * true_error / np.sqrt(200)
     assert _mixing.simulated_rate(np.array([0.0])) is None
     assert _mixing.simulated_rate(np.array([0.0, -np.inf])).per_step == 0.0
+
+
+def test_the_first_tenth_says_nothing_of_a_rate():
+    """Errors that grow at first, and then fall by a tenth of their logarithm per step."""
+    logs = np.concatenate([0.3 * np.arange(20), 5.7 - 0.1 * np.arange(1, 182)])
+    rate = _mixing.simulated_rate(logs)
+    assert rate.from_step == 20
+    assert rate.per_step == pytest.approx(np.exp(-0.1), rel=1e-12)
+    assert rate.known
+
+
+def test_a_pace_that_drifts_is_no_rate():
+    """Powers of k, and a change halfway; chance alone hardly ever looks so (none of 2,000)."""
+    k = np.arange(1001.0)
+    assert _mixing.simulated_rate(-np.log1p(k)).trend == "rising"
+    assert _mixing.simulated_rate(-1e-4 * k**1.5).trend == "falling"
+    assert not _mixing.simulated_rate(-np.log1p(k)).known
+    assert _mixing.simulated_rate(-0.1 * k - 1e-6 * k**2).trend == "none"  # by 2 % of itself
+    rng = np.random.default_rng(7)
+    steady = np.cumsum(-0.1 + 0.5 * rng.normal(size=(2000, 1001)), axis=1)
+    assert all(_mixing.simulated_rate(logs).known for logs in steady)
+    drifting = _mixing.simulated_rate(-3 * np.log1p(k) + 0.01 * rng.normal(size=1001))
+    assert drifting.trend == "rising"
+
+
+def test_errors_that_die_as_one_over_k_have_no_time_constant():
+    """A constant without noise: its filter averages, however long."""
+    for steps in (500, 2000):
+        found = analyse(load("observability_scalar", [f"analyses.stability.steps={steps}"]))
+        assert found.conclusions[0].endswith("errors die away, but slower and slower: no rate.")
+        simulated = row(found.tables["rates"], kind="simulated")
+        assert (simulated["rate_per_step"], simulated["time_constant_steps"]) == (None, None)
+        assert "slower and slower" in simulated["because"]
+        assert set(found.table.columns["simulated_rate_per_step"]) == {None}
+        labels = [line.label for line in found.charts[1].panels[0].lines]
+        assert not any(label.startswith("simulated rate") for label in labels)
+
+
+def test_a_simulation_may_be_too_short_for_a_rate(tmp_path):
+    found = analyse(load("stability_cv_ct", ["analyses.stability.steps=100"]))
+    assert "the simulation of 100 steps is too short for a rate." in found.conclusions[0]
+    away = "modes.fast.state_transition=[[1.5, 0.5], [0, 2]]"
+    found = analyse(scenario(tmp_path, CHAIN, away))
+    assert "of its 5,000 steps, too short for a rate." in found.conclusions[0]
+    assert row(found.tables["rates"], kind="simulated")["rate_per_step"] is None
+
+
+def paced(trend, *halves):
+    """The words for a simulation of 200 steps whose halves go at these paces."""
+    found = examine(model_of("stability_cv_ct"), 2, 200, 1)
+    return no_rate(found._replace(rate=_mixing.Rate(0.9, 0.01, 20, trend, halves)))
+
+
+def test_a_pace_that_drifts_has_words():
+    assert paced("none", -0.1, -0.1) == ""
+    assert paced("rising", -0.2, -0.1).endswith("but slower and slower: no rate")
+    assert paced("falling", -0.1, -0.2).endswith("faster and faster: no rate")
+    assert "in the simulation's later half errors don't die" in paced("rising", -0.2, 0.1)
+    assert "in the later half only" in paced("falling", 0.1, -0.2)
+
+
+def test_the_bounds_that_are_drawn_are_those_due(reference_case):
+    """The settled floor of the reference case is a bound from step 202 on, beyond the figure."""
+    for panel, floor in zip(reference_case.charts[0].panels, (17.197, 0.78226) * 2, strict=True):
+        (band,) = panel.bands
+        assert band.x[0] == 2
+        assert band.low[0] < 0.2
+        assert (np.diff(band.low) >= -1e-12).all()
+        assert band.low[-1] == pytest.approx(floor, rel=1e-2)
+        for line in panel.lines:
+            assert line.y.max() <= panel.y_limits[1]
+            assert (line.y[2:] >= band.low).all()
+            assert (line.y[2:] <= band.high).all()
+
+
+def test_a_ceiling_alone_is_drawn_as_a_reference():
+    found = analyse(load("stability_embedded_cv", ["analyses.stability.steps=200"]))
+    for panel in found.charts[0].panels:
+        assert not panel.bands
+        assert [(line.label, line.reference) for line in panel.lines] == [
+            ("CV", False),
+            ("CA", False),
+            ("ceiling", True),
+        ]
+        ceiling = panel.lines[2].y
+        assert max(line.y.max() for line in panel.lines[:2]) <= panel.y_limits[1] < ceiling[0]
+        assert ceiling[0] > ceiling[-1]
+        assert all((line.y <= ceiling).all() for line in panel.lines[:2])
+
+
+def test_certified_curves_hold_up_to_a_factor():
+    certified = {
+        line.label
+        for name in ("stability_cv_ct", "stability_ca")
+        for line in analyse(load(name, ["analyses.stability.steps=200"])).charts[1].panels[0].lines
+        if line.label.startswith(("certified", "one-step"))
+    }
+    assert len(certified) == 2
+    assert all(label.endswith(", up to a constant factor") for label in certified)
 
 
 def test_a_flight_is_drawn_from_the_banks_own_chain():
@@ -937,11 +1074,71 @@ def test_a_floor_that_doesnt_hold_yet_is_told(tmp_path):
 
 def test_a_given_spread_is_held_against_the_simulation():
     narrow = analyse(load("stability_cv_ct", ["analyses.stability.spread_std=[10, 1, 10, 1]"]))
-    assert any("exceeded what is given at" in note for note in narrow.notes)
+    note = next(note for note in narrow.notes if "exceeded what is given at" in note)
+    share = note[note.index(" at ") :]
+    assert narrow.conclusions[1].endswith(
+        f"rests on the spread of the means, which the simulation exceeded{share}."
+    )
+    assert f"vy 1 (given), which the simulation exceeded{share}." in narrow.conclusions[2]
     wide = analyse(load("stability_cv_ct", ["analyses.stability.spread_std=[300]"]))
     assert any("never exceeded what is given" in note for note in wide.notes)
-    assert "(given)" in wide.conclusions[2]
+    assert wide.conclusions[2].endswith("(given).")
+    assert not any("the simulation exceeded" in sentence for sentence in wide.conclusions)
     assert row(wide.tables["eigenvalues"], bound="ceiling given the spread")["steps_broken"] == 0
+
+
+def test_no_spread_is_told_once():
+    """The ceiling given a spread of 0 is the one without a spread."""
+    none = analyse(load("stability_cv_ct", ["analyses.stability.spread_std=[0]"]))
+    assert not any(sentence.startswith("Without the spread") for sentence in none.conclusions)
+    assert "(given), which the simulation exceeded at 99." in none.conclusions[2]
+    some = analyse(load("stability_cv_ct"))
+    assert some.conclusions[3].startswith("Without the spread of the modes' means")
+
+
+def test_what_could_not_be_checked_is_told():
+    """11 steps are fewer than N = 12, and than the ceiling takes to settle."""
+    changes = ["analyses.stability.steps=11", "analyses.stability.measurements=12"]
+    notes = analyse(load("stability_cv_ct", changes)).notes
+    assert "the floor isn't checked from N = 12 on: the simulation has only 11 steps" in notes
+    note = next(note for note in notes if note.startswith("the ceiling without spread, due from"))
+    assert note.endswith("on, isn't checked: the simulation has only 11 steps")
+    long = analyse(load("stability_cv_ct", ["analyses.stability.steps=200"])).notes
+    assert not any("isn't checked" in note for note in long)
+
+
+def test_a_certified_rate_is_useless_only_where_it_is():
+    """Time constants of 4 / log(1 + c_1) steps, against some 6 simulated."""
+    found = examine(model_of("stability_cv_ct"), 2, 300, 1)
+    simulated = -1 / np.log(found.rate.per_step)
+    for times, useless in ((1010, True), (990, False), (12, False)):
+        c_1 = np.expm1(4 / (times * simulated))
+        certificate = found.certificate._replace(c_1=c_1)
+        sentence = findings(found._replace(certificate=certificate)).conclusions[1]
+        assert ("valid and useless" in sentence) == useless
+        assert (f", {times} times the simulated one; this rests" in sentence) == (not useless)
+    rate = found.rate._replace(trend="rising")
+    sentence = findings(found._replace(rate=rate)).conclusions[1]
+    assert "useless" not in sentence
+    assert "times" not in sentence
+
+
+def test_a_page_has_beta_1_and_beta_2_and_few_tables(reference_case):
+    printed = {name: table.shown for name, table in reference_case.tables.items() if table.shown}
+    assert list(printed) == ["rates", "bounds", "eigenvalues"]
+    cells = printed["eigenvalues"]
+    smallest = dict(zip(cells["P_j(k|k)"], cells["smallest\neigenvalue"], strict=True))
+    largest = dict(zip(cells["P_j(k|k)"], cells["largest\neigenvalue"], strict=True))
+    assert smallest["floor (smallest: beta_1)"] == "0.3153"
+    beta_2 = largest["ceiling if spread (largest: beta_2)"]
+    assert largest["ceiling, no spread"] == "854.1"
+    assert "simulated, from step 10" in smallest
+    assert any(f"no larger: beta_2 {beta_2}, beta_3" in note for note in reference_case.notes)
+    bare = printed["bounds"]["ceiling,\nno spread"]
+    assert bare == ["29.08", "4.323", "29.08", "4.323"]
+    # Where the theorem says nothing, the ceiling still has its beta_2.
+    other = analyse(load("stability_embedded_cv", ["analyses.stability.steps=200"]))
+    assert any("no larger: beta_2 " in note and "beta_3" not in note for note in other.notes)
 
 
 def test_one_mode_is_no_imm(tmp_path):
@@ -963,8 +1160,13 @@ def test_too_many_sequences_and_steps_are_refused():
     assert longest_sequence(100, None) == 2
     with pytest.raises(UserError, match=r"1,048,576 sequences.*'measurements'.*to 14 or less"):
         longest_sequence(2, 20)
-    with pytest.raises(UserError, match="name fewer modes"):
-        longest_sequence(200, None)
+    with pytest.raises(UserError) as refused:
+        longest_sequence(2, 20)
+    assert refused.value.keys == ("analyses", "stability", "measurements")
+    for measurements in (None, 3):
+        with pytest.raises(UserError, match="name fewer modes") as refused:
+            longest_sequence(200, measurements)
+        assert refused.value.keys == ("modes",)
     six = ["analyses.stability.steps=100000", "analyses.stability.measurements=2"]
     analyse(load("stability_ca", ["analyses.stability.steps=10"]))
     with pytest.raises(UserError, match="'spread_std' has 3 numbers for the states x vx y vy"):

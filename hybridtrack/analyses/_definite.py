@@ -88,6 +88,11 @@ def is_definite(covariance: Array) -> bool:
 
 
 def is_singular(matrix: Array) -> bool:
-    """Whether a square matrix (n, n) has no inverse in numbers."""
-    values = np.linalg.svd(matrix, compute_uv=False)
+    """Whether a square matrix (n, n), a map of states, has no inverse in numbers.
+
+    It is balanced first, since the states' units mustn't decide.
+    """
+    from scipy.linalg import matrix_balance
+
+    values = np.linalg.svd(matrix_balance(matrix, permute=False)[0], compute_uv=False)
     return bool(values[-1] <= RANK_TOLERANCE * values[0])

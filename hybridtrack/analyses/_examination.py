@@ -83,6 +83,20 @@ class Stability(NamedTuple):
     step_s: float
     steps_asked: int
 
+    @property
+    def ended_early(self) -> bool:
+        """Whether the simulation got too large for its numbers before its last step."""
+        return len(self.run.mixing) < self.steps_asked
+
+    @property
+    def one_rate(self) -> float | None:
+        """The simulated rate per step, where the simulation shows one; 0: no error is left."""
+        if self.rate is None or not self.rate.known:
+            return None
+        if self.ended_early and self.rate.per_step > 0.0:
+            return None
+        return self.rate.per_step
+
 
 def examine(
     model: JumpMarkovModel, longest: int, steps: int, seed: int, spread: Array | None = None

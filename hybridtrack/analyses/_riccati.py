@@ -209,7 +209,7 @@ def floor(bank: Bank, figures: tuple[Figures, ...]) -> Bound:
     if settled:
         return Bound(path, start.measurements, why)
     last = figures[-1]
-    why = f"{why}; it is beta_1 I instead, of N = {last.measurements}"
+    why = f"the iteration was given up: {why}; it is beta_1 I instead, of N = {last.measurements}"
     return Bound(last.beta_1 * np.eye(n_x)[np.newaxis], last.measurements, why)
 
 
@@ -256,7 +256,7 @@ def _iterated(bank: Bank, start: Array, spread: Array, choose: Choice) -> tuple[
         if _change(path[-2], path[-1]) < SETTLED:
             return np.stack(path), True, remark
         if np.abs(path[-1]).max() > LARGEST:
-            break
+            return np.stack(path), False, f"it grew beyond {LARGEST:g} within {step + 1:,} steps"
     return np.stack(path), False, remark
 
 

@@ -11,6 +11,7 @@ from hybridtrack.analyses._riccati import Bound, Certificate
 from hybridtrack.analyses._stability_words import (
     modes,
     near_one,
+    no_rate,
     number,
     one_step_rate,
     stds,
@@ -20,7 +21,7 @@ from hybridtrack.analyses._stability_words import (
 
 def sequences(found: Stability) -> Table:
     figures = found.figures
-    simulated = found.rate.per_step if found.rate is not None else None
+    simulated = found.one_rate
     certificate = found.certificate
     certified = certificate.rate if certificate is not None else None
     short = certificate.short if certificate is not None else None
@@ -50,6 +51,7 @@ def sequences(found: Stability) -> Table:
 
 
 def conditions(found: Stability) -> Table:
+    """Nothing of it is shown: a note says it in a sentence."""
     asked, bank, last = found.conditions, found.bank, found.figures[-1]
     longest = asked.longest
     singular = f"A of {modes(asked.singular)} is singular" if asked.singular else ""
@@ -96,11 +98,6 @@ def conditions(found: Stability) -> Table:
             "needs_measurements": needs,
             "because": reasons,
         },
-        {
-            "condition": names,
-            "verdict": verdicts,
-            "N": ["-" if n is None else str(n) for n in needs],
-        },
     )
 
 
@@ -133,7 +130,9 @@ def rates(found: Stability) -> Table:
         constant = _time_constant(root, short)
         rows.append(("one step, ours", None, root, short, None, constant, True, ""))
     rate = found.rate
-    if rate is not None:
+    if rate is None or found.one_rate is None:
+        rows.append(("simulated", None, None, None, None, None, False, no_rate(found)))
+    else:
         rows.append(
             (
                 "simulated",
@@ -192,7 +191,7 @@ def bounds(found: Stability) -> Table:
         "simulated_smallest_std": simulated.min(axis=(0, 1)).tolist(),
         "simulated_largest_std": simulated.max(axis=(0, 1)).tolist(),
     }
-    shown = {"state": list(found.bank.states)}
+    shown = {"std of": list(found.bank.states)}
     for heading, name in {
         "floor": "floor_std",
         "smallest\nsimulated": "simulated_smallest_std",
@@ -239,7 +238,12 @@ def eigenvalues(found: Stability, checked: Checks) -> Table:
             "because": why,
         },
         {
-            "P_j(k|k)": names,
+            "P_j(k|k)": [
+                "floor (smallest: beta_1)",
+                "ceiling if spread (largest: beta_2)",
+                "ceiling, no spread",
+                f"simulated, from step {longest}",
+            ],
             "smallest\neigenvalue": [number(value) for value in smallest_],
             "largest\neigenvalue": [number(value) for value in largest_],
             "broken at\n% of steps": [
@@ -250,7 +254,10 @@ def eigenvalues(found: Stability, checked: Checks) -> Table:
 
 
 def constants(found: Stability) -> Table:
-    """The betas and c_1; None where the theorem doesn't get so far."""
+    """The betas and c_1; None where the theorem doesn't get so far.
+
+    Nothing of it is shown: beta_1 and beta_2 are among the eigenvalues, and a note has the others.
+    """
     one, printed = found.certificate, found.printed_certificate
     first = next((figures for figures in found.figures if figures.controllable), None)
     high, low = found.ceiling.matrix, found.floor.matrix
@@ -301,11 +308,6 @@ def constants(found: Stability) -> Table:
             "value": values,
             "conditional_on_spread": conditional,
             "from": sources,
-        },
-        {
-            "constant": names,
-            "value": [number(value) for value in values],
-            "if spread": ["yes" if value else "no" for value in conditional],
         },
     )
 

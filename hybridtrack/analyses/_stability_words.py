@@ -9,9 +9,11 @@ from hybridtrack.analyses._examination import Checks, Held, Stability
 from hybridtrack.models import Array
 
 PRINTED = (
-    "lemma 1 (Deyst and Price) is no bound in general: of 2,000 random time-invariant two-state "
-    "systems some 9 % violate the lower bound, and as many the upper; they are computed as printed "
-    "under beta_1_printed and upper_bound_printed, and used for nothing but the rate so labelled",
+    "lemma 1 (Deyst and Price) is no bound in general: in one test of 2,000 time-invariant "
+    "two-state systems, with normal entries of A, B and C, R = 1 and N = 2, some 9 % violated the "
+    "lower bound, and as many the upper; other ensembles give 5 to 16 %. The two are computed as "
+    "printed under beta_1_printed and upper_bound_printed, and used for nothing but the rate so "
+    "labelled",
     "definition 3 is printed with N + 1 terms and measurements at i + 1; N here counts "
     "measurements, as section III-C needs it: N = 2 are those at k and k - 1",
     "lemma 5 takes the spread of the modes' means, Q^e (eq. 32), as bounded, and nothing in the "
@@ -22,6 +24,9 @@ PRINTED = (
     "stability is that of the homogeneous errors (18); the mismatch phi(k) of a filter whose mode "
     "is not the true one drives them all the time and isn't covered",
 )
+
+
+USELESS = 1_000  # times the simulated time constant
 
 
 def number(value: float | None) -> str:
@@ -44,7 +49,11 @@ def _duration(seconds: float) -> str:
 
 def _share(part: Held) -> str:
     assert part.share is not None
-    return f"{100 * part.share:.4g} % of {part.checked:,} steps"
+    return f"{100 * part.share:.4g} % of {_steps(part.checked)}"
+
+
+def _steps(n: int) -> str:
+    return "1 step" if n == 1 else f"{n:,} steps"
 
 
 def listed(names: Sequence[str]) -> str:
@@ -91,10 +100,11 @@ def verdict(found: Stability) -> str:
 def _simulated_words(found: Stability) -> str:
     steps = len(found.logs) - 1
     rate = found.rate
-    if rate is None:
-        return "nothing could be simulated"
+    missing = no_rate(found)
+    if rate is None or missing:
+        return missing
     if rate.per_step == 0.0:
-        return "in the simulation nothing at all is left of the first errors"
+        return "in the simulation nothing is left of the first errors, to double precision"
     short = 1 - rate.per_step
     error = "" if rate.standard_error is None else f" (standard error {rate.standard_error:.1g})"
     words = f"simulated rate {near_one(rate.per_step, short)}{error} per step over {steps:,} steps"
@@ -107,13 +117,45 @@ def _simulated_words(found: Stability) -> str:
     return f"{words}: errors don't die away"
 
 
-def _certified_words(found: Stability) -> str | None:
+def no_rate(found: Stability) -> str:
+    """Why the simulation shows no rate, in a clause; empty where it shows one."""
+    if found.one_rate is not None:
+        return ""
+    steps, rate = len(found.logs) - 1, found.rate
+    if rate is None:
+        return "nothing could be simulated"
+    if found.ended_early:
+        return (
+            f"the simulation ends after {steps:,} of its {found.steps_asked:,} steps, too short "
+            "for a rate"
+        )
+    if rate.standard_error is None:
+        return f"the simulation of {steps:,} steps is too short for a rate"
+    earlier, later = rate.halves
+    if later >= 0.0:
+        return "in the simulation's later half errors don't die away, and there is no one rate"
+    if earlier >= 0.0:
+        return "in the simulation errors die away in the later half only: no rate"
+    if rate.trend == "rising":
+        return "in the simulation errors die away, but slower and slower: no rate"
+    return "in the simulation errors die away faster and faster: no rate"
+
+
+def _certified_words(found: Stability, checked: Checks) -> str | None:
     one = found.certificate
     parts = []
     if one is not None:
+        steps = one.time_constant_steps
+        useless, times = "", ""
+        if found.one_rate is not None and 0.0 < found.one_rate < 1.0:
+            ratio = -steps * math.log(found.one_rate)
+            if ratio > USELESS:
+                useless = ", valid and useless"
+            else:
+                times = f", {ratio:.3g} times the simulated one"
         parts.append(
-            f"the theorem certifies {near_one(one.rate, one.short)} per step, valid and useless: "
-            f"its time constant is {_duration(one.time_constant_steps * found.step_s)}"
+            f"the theorem certifies {near_one(one.rate, one.short)} per step{useless}: its time "
+            f"constant is {_duration(steps * found.step_s)}{times}"
         )
     if found.one_step_loss is not None:
         parts.append(
@@ -122,32 +164,40 @@ def _certified_words(found: Stability) -> str | None:
         )
     if not parts:
         return None
+    rest = "both rest" if len(parts) > 1 else "this rests"
     sentence = "; ".join(parts)
-    return f"{sentence[0].upper()}{sentence[1:]}; both rest on the spread of the means."
+    return (
+        f"{sentence[0].upper()}{sentence[1:]}; {rest} on the spread of the means"
+        f"{_exceeded(found, checked)}."
+    )
+
+
+def _exceeded(found: Stability, checked: Checks) -> str:
+    """A clause about a spread that is given, and that the simulation shows to be too small."""
+    part = checked.spread
+    return f", which the simulation exceeded at {_share(part)}" if part.broken else ""
 
 
 def conclusions(found: Stability, checked: Checks) -> tuple[str, ...]:
     """The verdict and the rates, what is certified, the bounds, and what they hang on."""
     sentences = [f"{verdict(found)[0].upper()}{verdict(found)[1:]}; {_simulated_words(found)}."]
-    certified = _certified_words(found)
+    certified = _certified_words(found, checked)
     if certified is not None:
-        if found.certificate is None or found.one_step_loss is None:
-            certified = certified.replace("both rest", "this rests")
         sentences.append(certified)
-    sentences.append(_bounds_words(found))
-    if checked.bare_ceiling.checked:
+    sentences.append(_bounds_words(found, checked))
+    if checked.bare_ceiling.checked and found.spread.any():
         sentences.append(
             "Without the spread of the modes' means, which the paper nowhere bounds, the ceiling "
             + (
                 f"is exceeded at {_share(checked.bare_ceiling)}."
                 if checked.bare_ceiling.broken
-                else f"holds here too, at all of {checked.bare_ceiling.checked:,} steps."
+                else f"holds here too, at all of {_steps(checked.bare_ceiling.checked)}."
             )
         )
     return tuple(sentences)
 
 
-def _bounds_words(found: Stability) -> str:
+def _bounds_words(found: Stability, checked: Checks) -> str:
     low, high = found.floor.matrix, found.ceiling.matrix
     states = found.bank.states
     if low is None and high is None:
@@ -159,7 +209,10 @@ def _bounds_words(found: Stability) -> str:
             f"From step {found.floor.from_step} on no filter's standard deviations fall below "
             f"{figures}; there is no ceiling: {found.ceiling.why}."
         )
-    given = f"as long as the spread of the modes' means is at most {_spread_words(found)}"
+    given = (
+        f"as long as the spread of the modes' means is at most {_spread_words(found)}"
+        f"{_exceeded(found, checked)}"
+    )
     if low is None:
         return (
             f"From step {found.ceiling.from_step} on no filter's standard deviations rise above "
@@ -213,15 +266,18 @@ def _conditions_words(found: Stability) -> str:
 
 
 def _constants_words(found: Stability) -> list[str]:
-    one, printed = found.certificate, found.printed_certificate
-    if one is None or printed is None:
+    if found.ceiling.matrix is None:
         return []
-    return [
-        "constants, as long as the spread of the means is no larger: beta_3 "
-        f"{one.beta_3:.4g}, beta_4 {one.beta_4:.4g}, beta_5 {one.beta_5:.4g}; c_1 {one.c_1:.4g} "
-        f"with beta_1 {one.beta_1:.4g} of the floor, {printed.c_1:.4g} with {printed.beta_1:.4g} "
-        "as printed"
-    ]
+    beta_2 = float(np.linalg.eigvalsh(found.ceiling.matrix)[-1])
+    words = f"constants, as long as the spread of the means is no larger: beta_2 {beta_2:.4g}"
+    one, printed = found.certificate, found.printed_certificate
+    if one is not None and printed is not None:
+        words += (
+            f", beta_3 {one.beta_3:.4g}, beta_4 {one.beta_4:.4g}, beta_5 {one.beta_5:.4g}; c_1 "
+            f"{one.c_1:.4g} with beta_1 {one.beta_1:.4g} of the floor, {printed.c_1:.4g} with "
+            f"{printed.beta_1:.4g} as printed"
+        )
+    return [words]
 
 
 def notes(found: Stability, checked: Checks) -> tuple[str, ...]:
@@ -233,7 +289,7 @@ def notes(found: Stability, checked: Checks) -> tuple[str, ...]:
         f"simulated: {steps:,} steps of a flight drawn from the bank's own chain, start and "
         "noises; eigenvalues mix the states' units, as the paper's do",
     ]
-    if steps < found.steps_asked:
+    if found.ended_early:
         said.append(
             f"the simulation ends before its {found.steps_asked:,} steps, since a state or a "
             "covariance gets too large (1e12)"
@@ -249,14 +305,25 @@ def notes(found: Stability, checked: Checks) -> tuple[str, ...]:
             )
         elif part.checked:
             said.append(
-                f"the floor held at all {part.checked:,} steps from N = "
+                f"the floor held at all of {_steps(part.checked)} from N = "
                 f"{found.conditions.longest} on"
+            )
+        else:
+            said.append(
+                f"the floor isn't checked from N = {found.conditions.longest} on: the simulation "
+                f"has only {steps:,} steps"
             )
         if checked.floor_in_time.broken:
             said.append(
                 f"the floor due at each step was broken at {_share(checked.floor_in_time)}, which "
                 "rounding alone can do: the bank's figures are too far apart for double precision"
             )
+    bare = found.bare_ceiling
+    if bare.matrix is not None and not checked.bare_ceiling.checked and found.spread.any():
+        said.append(
+            f"the ceiling without spread, due from step {bare.from_step:,} on, isn't checked: the "
+            f"simulation has only {steps:,} steps"
+        )
     for name, bound in (("floor", low), ("ceiling", high)):
         if bound.matrix is not None and bound.why:
             said.append(f"the {name} is valid, but {bound.why}")

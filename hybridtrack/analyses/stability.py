@@ -52,15 +52,15 @@ def longest_sequence(n_modes: int, measurements: int | None) -> int:
         longest = measurements
     if n_modes**longest > MOST_SEQUENCES:
         most = max((N for N in range(1, 25) if n_modes**N <= MOST_SEQUENCES), default=1)
-        remedy = (
-            f"set 'measurements' under analyses.stability to {most} or less"
-            if most >= 2
-            else "name fewer modes"
-        )
+        remedy = "name fewer modes"
+        keys: tuple[str, ...] = ("modes",)
+        if most >= 2:
+            remedy = f"set 'measurements' under analyses.stability to {most} or less"
+            keys = ("analyses", "stability", "measurements")
         raise Unsuited(
             f"{n_modes} modes have {n_modes**longest:,} sequences of N = {longest} measurements, "
             f"more than {MOST_SEQUENCES:,}; {remedy}",
-            "modes",
+            *keys,
         )
     return longest
 
