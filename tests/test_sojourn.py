@@ -27,7 +27,7 @@ from hybridtrack.analyses._sojourn_bounds import (
 )
 from hybridtrack.analyses._sojourn_observability import joint_observability
 from hybridtrack.analyses._switching_runs import Claimed, switching_runs
-from hybridtrack.analyses.sojourn import ANALYSIS, Settings, sojourn_study
+from hybridtrack.analyses.sojourn import ANALYSIS, Settings, _second_moment, sojourn_study
 from hybridtrack.config import ScenarioError, load, shipped
 from hybridtrack.errors import Unsuited, UserError
 from models import figure_5_model, random_model
@@ -553,6 +553,28 @@ def test_noise_alone_tells_two_modes_apart_that_no_rank_does():
     assert not told.met
 
 
+def test_lemma_2_may_need_one_output_more_than_the_recursions_order():
+    """One state, decaying by .9 or by .5, started at exactly 0: the third output tells."""
+    model = random_model(np.random.default_rng(14), n_modes=2, n_x=1, n_y=1)
+    model = model._replace(
+        state_transition=np.array([0.9, 0.5]).reshape(1, 2, 1, 1),
+        process_noise_covariance=np.ones((1, 2, 1, 1)),
+        measurement_matrix=np.ones((2, 1, 1)),
+        measurement_noise_covariance=np.ones((2, 1, 1)),
+    )
+    alike = [
+        np.allclose(
+            *(
+                slow.output_covariance(A, np.eye(1), np.eye(1), np.eye(1), 0.0, steps)
+                for A in (np.array([[0.9]]), np.array([[0.5]]))
+            )
+        )
+        for steps in (1, 2, 3)
+    ]
+    assert alike == [True, True, False]
+    assert joint_observability(model, np.zeros((1, 1))).covariance_steps == 3
+
+
 # ---- the simulation --------------------------------------------------------------------------
 
 
@@ -783,6 +805,83 @@ def test_stays_that_are_too_short_by_an_asymmetric_chain():
     found = study(*FIGURE_2A, "transition_matrix=[[0.9, 0.1], [0.4, 0.6]]")
     np.testing.assert_allclose(found.too_short_probability, [1 - 0.9**3, 1 - 0.6**3])
     assert found.flown == ("slow", 10)
+
+
+LEG = "{until_s: 200, turn_rate_deg_s: 2, mode: slow}"
+
+
+@pytest.mark.parametrize(
+    "legs",
+    [
+        f"[{LEG}]",
+        "[{until_s: 100, mode: slow}, {until_s: 200, turn_rate_deg_s: 2, mode: slow}]",
+        "[{until_s: 100}, {until_s: 200, turn_rate_deg_s: 2}]",
+    ],
+)
+def test_a_flight_that_never_switches_has_no_shortest_stay(legs):
+    assert study(*FIGURE_2A, f"truth.legs={legs}").flown is None
+    check(findings(*FIGURE_2A, f"truth.legs={legs}"))
+
+
+STRAIGHT = np.kron(np.eye(2), [[1.0, 2.0], [0.0, 1.0]]).tolist()
+NOISE = np.eye(4).tolist()
+
+
+def test_one_mode_flown_on_two_legs():
+    asked = {
+        "truth.legs": "[{until_s: 100, mode: slow}, {until_s: 200, mode: slow}]",
+        "modes": f"{{slow: {{state_transition: {STRAIGHT}, process_noise_covariance: {NOISE}}}}}",
+        "transition_matrix": "[[1]]",
+        "initial.mode_probabilities": "{slow: 1}",
+        "estimators": "{KF: {type: kalman, mode: slow}}",
+        "compare_with": "null",
+    }
+    found = findings(*FIGURE_2A, *(f"{key}={value}" for key, value in asked.items()))
+    assert "one mode" in found.conclusions[0]
+    check(found)
+
+
+def without_reference(experiment, unknown=slice(None)):
+    """The scenario with a truth that isn't known at the given steps."""
+    (case,) = experiment.cases
+    state = case.truth.state.copy()
+    state[unknown] = math.nan
+    truth = case.truth._replace(state=state)
+    return experiment._replace(cases=(case._replace(truth=truth),))
+
+
+def test_a_truth_that_is_not_known_bounds_nothing():
+    experiment = without_reference(load("sojourn_fig2a"))
+    settings = Settings(simulated_runs=10)
+    found = ANALYSIS.analyse(experiment, settings, None)
+    assert rows(found.table, "bound")["direct"]["disturbance"] is None
+    assert rows(found.tables["conditions"], "condition")[5]["met"] is None
+    said = " ".join(found.notes)
+    assert "the flight itself has" not in said
+    assert "taken as 0, since the truth isn't known" in said
+    late = settings._replace(decision_delay_steps=1, error_bound=20.0)
+    with pytest.raises(UserError, match="how large vx and vy may be; add 'state_bound'"):
+        ANALYSIS.analyse(experiment, late, None)
+
+
+def test_a_truth_with_gaps_bounds_by_what_is_known():
+    whole, gaps = load("sojourn_fig2a"), without_reference(load("sojourn_fig2a"), slice(3, 20))
+    settings = Settings(simulated_runs=10)
+    one, other = (sojourn_study(each, settings) for each in (whole, gaps))
+    assert other.disturbance.euclidean == pytest.approx(one.disturbance.euclidean, rel=1e-3)
+    assert any("the flight itself has, where it is known" in note for note in other.notes)
+
+
+def test_the_start_of_a_filter_about_the_truth_has_its_covariance():
+    """Pi_0 = x x' + P, with x the truth's and P the filters'."""
+    start = "truth.start={position_m: [3, -2], speed_kt: 0, heading_deg: 0}"
+    experiment = load("sojourn_fig2a", [start])
+    model = study(*FIGURE_2A).model
+    moment, (said,) = _second_moment(experiment, model)
+    expected = np.diag([1.0, 100.0, 1.0, 100.0])  # of positions 1 m, of velocities 10 m/s
+    expected += np.outer([3, 0, -2, 0], [3, 0, -2, 0])
+    np.testing.assert_allclose(moment, expected, rtol=ROUNDING)
+    assert said.endswith("is that of the truth")
 
 
 def test_the_same_seed_gives_the_same_findings():

@@ -6,6 +6,7 @@ switches by which that is paid back (section 3, Theorem 3); their bound is here 
 its proof has it, beside what the powers of the filters' own matrices say.
 """
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ from hybridtrack.analyses._sojourn_tables import (
     modes_table,
     simulation_table,
 )
-from hybridtrack.analyses._sojourn_words import conclusions, notes, plural
+from hybridtrack.analyses._sojourn_words import conclusions, listed, notes, plural
 from hybridtrack.analyses._switching_runs import (
     MOST_CELLS,
     Claimed,
@@ -231,7 +232,10 @@ def _check_rate(
 def _state_bound(
     experiment: Experiment, settings: Settings, model: JumpMarkovModel, wrong: Mismatch
 ) -> tuple[StateBound, tuple[str, ...]]:
-    """As set, else what the scenario's flights have; inf where neither says anything."""
+    """As set, else what the scenario's flights have; inf where neither says anything.
+
+    A flight that is known here and there alone has what is known of it.
+    """
     names, counts = model.state_names, wrong.counts
     if settings.state_bound is not None or settings.state_norm_bound is not None:
         listed = [math.inf] if settings.state_bound is None else settings.state_bound
@@ -254,23 +258,27 @@ def _state_bound(
             )
         norm = math.inf if settings.state_norm_bound is None else settings.state_norm_bound
         return StateBound(np.minimum(np.broadcast_to(given, len(names)), norm), norm), ()
-    each, norm = np.zeros(len(names)), 0.0
+    each, norm, gaps = np.zeros(len(names)), 0.0, False
     for case in experiment.cases:
         if isinstance(case.truth, ChainTruth):
             return StateBound(np.full(len(names), math.inf), math.inf), ()
         flown = _in_order(case.truth.state, case.truth.state_names, names, math.inf)
-        flown = np.where(np.isnan(flown), 0.0, np.abs(flown))
-        each = np.maximum(each, flown.max(axis=0))
-        norm = max(norm, float(np.linalg.norm(flown[:, counts], axis=1).max()))
+        unknown = np.isnan(flown)
+        gaps = gaps or bool(unknown[:, counts].any())
+        largest = np.where(unknown, -math.inf, np.abs(flown)).max(axis=0)
+        each = np.maximum(each, np.where(unknown.all(axis=0), math.inf, largest))
+        told = flown[:, counts][~unknown[:, counts].any(axis=1)]
+        norm = max(norm, float(np.linalg.norm(told, axis=1).max()) if len(told) else math.inf)
     if not counts.any():
         return StateBound(each, norm), ()
-    largest = ", ".join(
+    had = ", ".join(
         f"{name} {bound:.4g}"
         for name, bound, count in zip(names, each, counts, strict=True)
         if count and math.isfinite(bound)
     )
-    said = f"the states' bounds are what the flight itself has ({largest}, SI units)"
-    return StateBound(each, norm), (said,) if largest else ()
+    known = ", where it is known" if gaps else ""
+    said = f"the states' bounds are what the flight itself has{known} ({had}, SI units)"
+    return StateBound(each, norm), (said,) if had else ()
 
 
 def _in_order(
@@ -285,7 +293,10 @@ def _in_order(
 
 
 def _second_moment(experiment: Experiment, model: JumpMarkovModel) -> tuple[Array, tuple[str, ...]]:
-    """E[x_0 x_0'] (n_x, n_x), the paper's Pi_0: of the filters' start, or where the truth's is."""
+    """E[x_0 x_0'] (n_x, n_x), the paper's Pi_0: of the filters' start, or where the truth's is.
+
+    What the truth doesn't say is taken as 0, and said.
+    """
     initial, names = experiment.initial, model.state_names
     if not (initial.follows_truth or initial.two_point):
         return np.outer(initial.mean, initial.mean) + initial.covariance, ()
@@ -294,10 +305,17 @@ def _second_moment(experiment: Experiment, model: JumpMarkovModel) -> tuple[Arra
         start, there = truth.initial_mean, truth.bank.state_names
     else:
         start, there = truth.state[0], truth.state_names
-    mean = np.nan_to_num(_in_order(start[np.newaxis], there, names, 0.0)[0])
-    said = "for condition 1 the mean of the start is that of the truth"
+    mean = _in_order(start[np.newaxis], there, names, math.nan)[0]
+    unknown = [name for name, value in zip(names, mean, strict=True) if math.isnan(value)]
+    told = "that of the truth"
     if len(experiment.cases) > 1:
-        said += f" in '{experiment.cases[0].name}'"
+        told += f" in '{experiment.cases[0].name}'"
+    if len(unknown) == len(names):
+        told = "taken as 0, since the truth isn't known"
+    elif unknown:
+        told += f", and 0 in {listed(unknown)}, of which it says nothing"
+    mean = np.where(np.isnan(mean), 0.0, mean)
+    said = f"for condition 1 the mean of the start is {told}"
     return np.outer(mean, mean) + initial.covariance, (said,)
 
 
@@ -309,7 +327,7 @@ def _flown(experiment: Experiment) -> tuple[str, int] | None:
             continue
         mode = case.truth.mode[1:]
         ends = np.flatnonzero(mode[1:] != mode[:-1]) + 1
-        for begin, end in zip((0, *ends[:-1]), ends, strict=True):
+        for begin, end in itertools.pairwise((0, *ends)):
             if mode[begin] >= 0 and (shortest is None or end - begin < shortest[1]):
                 shortest = experiment.truth_modes[mode[begin]], int(end - begin)
     return shortest
