@@ -598,7 +598,7 @@ def test_the_simulation_is_what_a_run_by_run_one_gives():
     Fs = [one.transition for one in study(*FIGURE_2A).filters]
     Fs.append(Fs[0] @ Fs[1])
     for sojourn in (1, 2):
-        ours = simulated(Fs, Claimed(0.99, 0.0, 1.0, 0.0), sojourn_steps=sojourn).at_switches
+        ours = simulated(Fs, Claimed(0.99, 0.0, 1.0), sojourn_steps=sojourn).at_switches
         runs, rng = 1000, np.random.default_rng(5)
         theirs = slow.share_that_breaks_the_claim(Fs, 0.99, sojourn, 2, runs, 60, rng)
         error = math.sqrt(theirs * (1 - theirs) * (1 / runs + 1 / 2000))
@@ -620,11 +620,11 @@ def test_no_run_breaks_the_direct_bound(seed, delay):
     bound = direct(Fs, U, 0.95, 1.2 * c, delay)
     found = simulated(
         Fs,
-        Claimed(0.95, 1.2 * c, max(bound.growth), c),
+        Claimed(0.95, 1.2 * c, max(bound.growth)),
         effect=effect,
         sojourn_steps=int(bound.steps) + delay,
         delay_steps=delay,
-        start=1e3 * c or 1.0,
+        start=np.tile([1e3 * c, 10 * c, 0.0, 0.0], 500) if c else 1.0,
         steps=250,
     )
     assert found.at_switches == 0
@@ -638,7 +638,7 @@ def test_what_the_paper_claims_of_steps_between_fails_and_what_is_printed_is_too
     F = np.array([[0.98, 0.0], [0.0, 0.5]])
     found = simulated(
         [F, F],
-        Claimed(0.99, 1.5, 1.0, 0.0),
+        Claimed(0.99, 1.5, 1.0),
         effect=np.tile(np.eye(2), (2, 2, 1, 1)),
         sojourn_steps=2,
         extra_steps=0,
@@ -647,6 +647,69 @@ def test_what_the_paper_claims_of_steps_between_fails_and_what_is_printed_is_too
         steps=300,
     )
     assert found.at_switches > 0.5
+
+
+def test_the_envelope_is_as_near_as_it_can_be():
+    """Of three quarters of the growth a fair share of runs is over, of all of it none."""
+    Fs = [one.transition for one in study(*FIGURE_2A).filters]
+    growth = max(direct(Fs).growth)
+    over = [
+        simulated(Fs, Claimed(0.99, 0.0, share * growth), sojourn_steps=4).over_envelope
+        for share in (0.75, 1.0)
+    ]
+    assert over[0] > 0.1
+    assert over[1] == 0
+
+
+def test_what_a_delay_adds_does_not_widen_the_envelope():
+    """A filter that never lets an error grow has the claim itself for an envelope."""
+    F = np.array([[0.98]])
+    effect = np.ones((2, 2, 1, 1))
+    too_short = simulated(
+        [F, F],
+        Claimed(0.99, 1.5, 1.0),
+        effect=effect,
+        sojourn_steps=2,
+        extra_steps=0,
+        delay_steps=1,
+        start=15.0,
+        steps=300,
+    )
+    assert too_short.over_envelope == too_short.between > 0.1
+
+
+def test_m0_is_held_against_errors_that_come_of_the_delay_alone():
+    """From 10 M0 no error would pass mu^t e_0 + M0 at these switches: mu^t alone hides them."""
+    F = np.array([[0.9]])
+    bound = direct([F, F], 1.0, 0.999, 1.05, 1)
+    assert bound.steps == 29  # 1 / (1 - .9^29) <= 1.05
+
+    def share(sojourn, start):
+        found = simulated(
+            [F, F],
+            Claimed(0.999, 1.05, 1.0),
+            effect=np.ones((2, 2, 1, 1)),
+            sojourn_steps=sojourn,
+            extra_steps=0,
+            delay_steps=1,
+            start=start,
+            steps=400,
+        )
+        return found.at_switches
+
+    assert share(30, 0.0) == share(30, 10.5) == share(20, 10.5) == 0
+    assert share(20, 0.0) > 0.5
+
+
+def test_half_of_the_runs_start_without_an_error_where_one_may_remain():
+    """M0 = 11.5, a little above c = 11.42, asks for 12 steps; 8 are too few, which those show."""
+    asked = [*FIGURE_2A, f"{KEY}decision_delay_steps=1", f"{KEY}error_bound=11.5"]
+    found = dict(study(*asked, f"{KEY}simulated_runs=400").simulated)
+    assert found[8].at_switches > 0.05
+    assert found[12].at_switches == 0
+    assert any(
+        "every second simulated run starts without" in note for note in findings(*asked).notes
+    )
 
 
 # ---- any scenario ----------------------------------------------------------------------------

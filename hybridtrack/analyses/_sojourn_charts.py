@@ -51,7 +51,7 @@ def _worst_run_chart(study: Study) -> Chart:
     start = float(runs.worst[0])
     allowed = study.rate**k * start + study.error_bound
     growth = max(study.direct.growth)
-    envelope = growth * allowed + (study.direct.delay_error or 0.0)
+    envelope = growth * allowed
     time_s = k * study.step_s
     floor = "" if study.error_bound == 0.0 else " + M0"
     lines = [

@@ -158,6 +158,11 @@ def notes(study: Study) -> list[str]:
             "simulated sojourns last from their smallest to "
             f"{round(study.direct.steps) - 1} steps more, all equally likely"
         )
+        if study.error_bound and study.delay_steps:
+            found.append(
+                "every second simulated run starts without an error, which holds M0 against what "
+                f"the delay leaves, the others at 10 M0 ({10 * study.error_bound:.4g})"
+            )
     return [*found, *study.notes]
 
 

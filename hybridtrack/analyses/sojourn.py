@@ -357,7 +357,11 @@ def _simulate(
     steps = min(steps, int(math.log(FADED) / math.log(rate)))
     if steps <= longest + delay:  # no run would come to a switch
         return ()
-    claimed = Claimed(rate, error_bound, max(direct.growth), direct.delay_error or 0.0)
+    claimed = Claimed(rate, error_bound, max(direct.growth))
+    # Every second run starts without an error where a delay leaves one: M0 alone is its bound then.
+    start = np.full(settings.simulated_runs, 10.0 * error_bound or 1.0)
+    if error_bound and delay:
+        start[1::2] = 0.0
     found = []
     for sojourn in whole_numbers(longest, MOST_SOJOURNS_TRIED):
         seed = np.random.SeedSequence(experiment.seed, spawn_key=(STREAM, sojourn))
@@ -374,7 +378,7 @@ def _simulate(
                     delay_steps=delay,
                     runs=settings.simulated_runs,
                     steps=steps,
-                    start=10.0 * error_bound or 1.0,
+                    start=start,
                     generator=np.random.default_rng(seed),
                 ),
             )
