@@ -1,7 +1,9 @@
 """How long a mode must last: the paper's example, what is wrong in it, and the bounds' promises."""
 
 import itertools
+import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -25,11 +27,13 @@ from hybridtrack.analyses._sojourn_bounds import (
     printed_bound,
     rate_correct_bound,
 )
+from hybridtrack.analyses._sojourn_numbers import number
 from hybridtrack.analyses._sojourn_observability import joint_observability
 from hybridtrack.analyses._switching_runs import Claimed, switching_runs
 from hybridtrack.analyses.sojourn import ANALYSIS, Settings, _second_moment, sojourn_study
 from hybridtrack.config import ScenarioError, load, shipped
 from hybridtrack.errors import Unsuited, UserError
+from hybridtrack.tables import LONG_TEXT
 from models import figure_5_model, random_model
 
 PRINTED = 1e-4  # relative: the figures are held to this; four digits or more were noted
@@ -131,7 +135,10 @@ def test_seven_conditions_of_the_papers_example(figure_2a):
     said = " ".join(figure_2a.conclusions)
     assert "4 steps (8 s)" in said
     assert "Condition 1 isn't met, by the paper's own Lemma 3" in said
-    assert "1-norm" in " ".join(figure_2a.notes)
+    assert "2.262 times what it shall be, in 'slow'" in said
+    noted = " ".join(figure_2a.notes)
+    assert "no bound in general; of what the states add it is 17.71, and by the" in noted
+    assert "2.262 times that at most between" in noted
 
 
 def test_random_switching_breaks_the_claim_below_4_steps_alone(figure_2a):
@@ -360,8 +367,15 @@ def test_a_deadbeat_filter_needs_as_many_steps_as_its_chain_is_long():
 
 
 def test_a_bound_beyond_all_measure_says_so():
-    with pytest.raises(UserError, match="mode 'm0' would have to last more than 50000 steps"):
+    why = (
+        "mode 'm0' would have to last more than 50000 steps: it decays at 0.9899999 per step, and "
+        "'convergence_rate' is 0.99; choose it further above that"
+    )
+    with pytest.raises(UserError, match=re.escape(why)):
         direct([np.array([[0.9899999, 1e4], [0.0, 0.9]])])
+    why = "it decays at 0.9999 per step, and the delay adds up to 1, where 'error_bound' is 1.001;"
+    with pytest.raises(UserError, match=re.escape(why)):
+        direct([[[0.9999]]], 1.0, 0.99999, 1.001, 1)
 
 
 # ---- eigenvalues -----------------------------------------------------------------------------
@@ -725,10 +739,10 @@ def check(found):
             assert kinds <= {float, int, bool, str}
             assert not any(isinstance(cell, float) and math.isnan(cell) for cell in column)
         widths = [
-            max(len(line) for line in (*head.split("\n"), *cells))
+            max(min(len(line), LONG_TEXT) for line in (*head.split("\n"), *cells))
             for head, cells in table.shown.items()
         ]
-        assert sum(widths) + 2 * (len(widths) - 1) <= 80
+        assert sum(widths) + 3 * (len(widths) - 1) <= 80
     assert 1 <= len(found.conclusions) <= 4
     assert len(found.charts) <= 2
     for chart, panel in itertools.product(found.charts, range(1)):
@@ -791,6 +805,10 @@ def test_what_can_be_asked_is_answered(asked):
             ["sojourn_fig2a", f"{KEY}convergence_rate=0.55"],
             r"mode 'sharp' decays at 0\.5567 per step: choose 'convergence_rate' above it",
         ),
+        (
+            ["sojourn_fig2a", f"{KEY}convergence_rate=0.556665"],
+            r"mode 'sharp' decays at 0\.55667 per step: .* \(it is 0\.556665\)",
+        ),
         (["sojourn_fig2a", f"{KEY}decision_delay_steps=-1"], "at least 0"),
         (["sojourn_fig2a", f"{KEY}decision_delay_steps=0.5"], "whole number"),
         (["sojourn_fig2a", f"{KEY}state_bound=[1, 2]"], "2 numbers; give one, or one for each"),
@@ -847,6 +865,110 @@ def test_settings_are_checked_without_a_scenario_too():
     ):
         with pytest.raises(UserError):
             sojourn_study(experiment, settings)
+
+
+SCALAR = {
+    "truth": {"chain": {"initial": {"mean": [0], "covariance": [[1]]}}},
+    "states": ["x"],
+    "initial": {"mean": [0], "covariance": [[1]]},
+    "transition_matrix": [[0.9, 0.1], [0.1, 0.9]],
+    "estimators": {"IMM": {"type": "imm"}},
+    "compare_with": None,
+    "dimensions": 1,
+}
+
+
+def scalar(slow_mode, fast_mode, **sojourn):
+    """Findings of two modes of one state each, which is measured; A and its noise."""
+    modes = {
+        name: {"state_transition": [[A]], "process_noise_covariance": [[Q]]}
+        for name, (A, Q) in (("slow", slow_mode), ("fast", fast_mode))
+    }
+    asked = SCALAR | {"modes": modes, "analyses": {"sojourn": {"simulated_runs": 10} | sojourn}}
+    return findings(
+        "sojourn_fig2a", *(f"{key}={json.dumps(value)}" for key, value in asked.items())
+    )
+
+
+def test_what_is_no_different_is_not_told():
+    """Scalars don't grow between switches, and of a 1 x 1 matrix all norms are one."""
+    found = scalar((0.9, 1.0), (0.5, 1.0), state_bound=[10])
+    noted = " ".join([*found.notes, *found.conclusions])
+    assert "1-norm" not in noted
+    assert "between" not in noted
+    assert "may grow" not in noted
+
+
+def test_large_numbers_are_alike_in_tables_and_sentences():
+    """ln(1 - c/M0) / ln alpha of a filter that decays slowly, in thousands of steps."""
+    found = scalar(
+        (0.9999, 1e-8), (0.9995, 1e-8), convergence_rate=0.99999, decision_delay_steps=1,
+        state_bound=[100], error_bound=0.045,
+    )  # fmt: skip
+    (steps,) = (
+        row["minimum_sojourn_steps"]
+        for row in rows(found.table, "bound").values()
+        if row["bound"] == "direct"
+    )
+    assert 10_000 < steps
+    assert found.table.shown["sojourn\nsteps"][2] == f"{steps:.0f}"
+    assert f"at least {steps:.0f} steps" in found.conclusions[0]
+    assert "the factor 0.99999 per step" in found.conclusions[0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"simulated_steps": 2}, "fills a run of 2: raise 'simulated_steps'"),
+        ({"simulated_runs": 100_000, "simulated_steps": 3}, "fills a run of 3: raise"),
+        ({"simulated_runs": 10**5, "decision_delay_steps": 60}, "of 50, as long as 100000 can be"),
+        ({"decision_delay_steps": 5000}, "fills a run of 5000, as long as one gets by itself"),
+        ({"convergence_rate": 1e-25, "decision_delay_steps": 8}, "the 8 after which 1e-25^t"),
+    ],
+)
+def test_why_nothing_is_simulated(asked, why):
+    model = (0.0, 1.0), (0.0, 2.0)
+    found = scalar(*model, **({"decision_delay_steps": 3} | asked))
+    assert "simulation" not in found.tables
+    assert any(why in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("value", "others", "text"),
+    [
+        (17.7071, (), "17.71"),
+        (10001.4, (), "10001"),
+        (123456789.0, (), "123456789"),
+        (1e12, (), "1e+12"),
+        (0.9999999, (1.0,), "0.9999999"),
+        (0.99004, (1.0, 0.99), "0.99004"),
+        (1.5, (1.5,), "1.5"),
+        (math.inf, (1.0,), "inf"),
+    ],
+)
+def test_as_many_digits_as_it_takes(value, others, text):
+    assert number(value, *others) == text
+
+
+def test_condition_7_says_by_what_it_is_judged(figure_2a):
+    flown = rows(figure_2a.tables["conditions"], "condition")[7]
+    assert flown["remark"].startswith(
+        "judged by the flight, whose shortest stay, in slow, lasts 10"
+    )
+    assert "0.271 of the stays in slow" in flown["remark"]
+    drawn = rows(findings("sojourn_fig2b", f"{KEY}simulated_runs=10").tables["conditions"], "asks")
+    assert drawn["sojourn long enough"]["remark"].startswith("judged by the modes' chain: by the")
+
+
+def test_unmet_conditions_say_so_by_their_number():
+    """Two axes alike repeat every eigenvalue; a delay of 2 is over eq. 39's 1.431."""
+    asked = [*FIGURE_2A, f"{KEY}error_bound=200", f"{KEY}decision_delay_steps=2"]
+    shown = findings(*asked).tables["conditions"].shown
+    assert shown["by"][5] == "2 steps, eq. 39 allows 1.431"
+    shown = findings("rmimm_fig5", f"{KEY}simulated_runs=10").tables["conditions"].shown
+    assert shown["condition"][3].startswith("4 ")
+    assert shown["met"][3] == "no"
+    assert "repeated eigenvalues in" in shown["by"][3]
 
 
 def test_one_mode_switches_nowhere():

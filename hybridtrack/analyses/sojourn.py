@@ -27,6 +27,7 @@ from hybridtrack.analyses._sojourn_bounds import (
     rate_correct_bound,
 )
 from hybridtrack.analyses._sojourn_charts import charts
+from hybridtrack.analyses._sojourn_numbers import as_set, number
 from hybridtrack.analyses._sojourn_observability import joint_observability
 from hybridtrack.analyses._sojourn_study import Study
 from hybridtrack.analyses._sojourn_tables import (
@@ -142,8 +143,8 @@ def sojourn_study(experiment: Experiment, settings: Settings) -> Study:
             raise Unsuited(
                 f"a decision delay of {delay} {plural('step', delay)} leaves an error for "
                 "ever, and how large it may be isn't said; add 'error_bound' under "
-                f"analyses.sojourn, above {smallest.delay_error:.4g} "
-                f"({smallest.error_bound_at_decay:.4g} costs no longer sojourn)",
+                f"analyses.sojourn, above {number(smallest.delay_error)} "
+                f"({number(smallest.error_bound_at_decay or 0.0)} costs no longer sojourn)",
                 "analyses",
                 "sojourn",
                 "error_bound",
@@ -153,6 +154,9 @@ def sojourn_study(experiment: Experiment, settings: Settings) -> Study:
     printed_errors = delay_errors(structures, disturbance.printed, n, delay)
     corrected_errors = delay_errors(structures, disturbance.infinity, n, delay)
     second_moment, of_start = _second_moment(experiment, model)
+    simulated, not_simulated = _simulate(
+        experiment, settings, transitions, wrong, state, direct, error_bound
+    )
     return Study(
         model=model,
         rate=rate,
@@ -167,9 +171,9 @@ def sojourn_study(experiment: Experiment, settings: Settings) -> Study:
         printed=printed_bound(structures, printed_errors, rate, error_bound),
         rate_correct=rate_correct_bound(structures, corrected_errors, rate, error_bound),
         direct=direct,
-        simulated=_simulate(experiment, settings, transitions, wrong, state, direct, error_bound),
+        simulated=simulated,
         flown=_flown(experiment),
-        notes=(*said, *of_start, *of_state),
+        notes=(*not_simulated, *said, *of_start, *of_state),
     )
 
 
@@ -177,8 +181,8 @@ def _check(settings: Settings) -> None:
     rate, delay = settings.convergence_rate, settings.decision_delay_steps
     if not 0.0 < rate < 1.0:
         raise Unsuited(
-            f"'convergence_rate' is {rate:g}; the factor by which an error shrinks per step lies "
-            "above 0 and below 1",
+            f"'convergence_rate' is {as_set(rate)}; the factor by which an error shrinks per step "
+            "lies above 0 and below 1",
             "analyses",
             "sojourn",
             "convergence_rate",
@@ -218,8 +222,8 @@ def _check_rate(
     alpha = structures[slowest].rate
     if rate <= alpha:
         raise Unsuited(
-            f"mode '{names[slowest]}' decays at {alpha:.4g} per step: choose 'convergence_rate' "
-            f"above it, and below 1 (it is {rate:g})",
+            f"mode '{names[slowest]}' decays at {number(alpha, 1.0, rate)} per step: choose "
+            f"'convergence_rate' above it, and below 1 (it is {as_set(rate)})",
             "analyses",
             "sojourn",
             "convergence_rate",
@@ -272,7 +276,7 @@ def _state_bound(
     if not counts.any():
         return StateBound(each, norm), ()
     had = ", ".join(
-        f"{name} {bound:.4g}"
+        f"{name} {number(bound)}"
         for name, bound, count in zip(names, each, counts, strict=True)
         if count and math.isfinite(bound)
     )
@@ -344,19 +348,17 @@ def _simulate(
     state: StateBound,
     direct: DirectBound,
     error_bound: float,
-) -> tuple[tuple[int, SwitchingRuns], ...]:
-    """Random switching by its smallest sojourn: up to the direct bound, where there is one."""
+) -> tuple[tuple[tuple[int, SwitchingRuns], ...], tuple[str, ...]]:
+    """Random switching by its smallest sojourn, up to the direct bound; or else why not."""
     delay, rate = settings.decision_delay_steps, settings.convergence_rate
-    if len(transitions) < 2 or not math.isfinite(direct.steps):
-        return ()
+    if len(transitions) < 2:
+        return (), ("there is one mode, and nothing to switch to: nothing is simulated",)
+    if not math.isfinite(direct.steps):
+        return (), ("nothing is simulated, since no sojourn is long enough",)
     longest = round(direct.steps)
-    steps = settings.simulated_steps
-    if steps is None:
-        steps = min(SOJOURNS_LONG * (longest + delay), LONGEST_RUN_STEPS)
-        steps = min(steps, MOST_CELLS // settings.simulated_runs)
-    steps = min(steps, int(math.log(FADED) / math.log(rate)))
+    steps, why = _run_length(settings, longest + delay)
     if steps <= longest + delay:  # no run would come to a switch
-        return ()
+        return (), (f"nothing is simulated, since a sojourn of {longest + delay} steps {why}",)
     claimed = Claimed(rate, error_bound, max(direct.growth))
     # Every second run starts without an error where a delay leaves one: M0 alone is its bound then.
     start = np.full(settings.simulated_runs, 10.0 * error_bound or 1.0)
@@ -383,7 +385,32 @@ def _simulate(
                 ),
             )
         )
-    return tuple(found)
+    return tuple(found), ()
+
+
+def _run_length(settings: Settings, sojourn: int) -> tuple[int, str]:
+    """The steps of a simulated run, and what keeps it from having more."""
+    runs, rate = settings.simulated_runs, settings.convergence_rate
+    faded = int(math.log(FADED) / math.log(rate))
+    limits = [(faded, f"outlasts the {faded} after which {as_set(rate)}^t is below {FADED:g}")]
+    if settings.simulated_steps is not None:
+        set_steps = settings.simulated_steps
+        limits.append((set_steps, f"fills a run of {set_steps}: raise 'simulated_steps'"))
+    else:
+        by_memory = MOST_CELLS // runs
+        limits += [
+            (SOJOURNS_LONG * sojourn, ""),
+            (
+                LONGEST_RUN_STEPS,
+                f"fills a run of {LONGEST_RUN_STEPS}, as long as one gets by itself: set "
+                "'simulated_steps' to more",
+            ),
+            (
+                by_memory,
+                f"fills a run of {by_memory}, as long as {runs} can be: lower 'simulated_runs'",
+            ),
+        ]
+    return min(limits)
 
 
 ANALYSIS = Analysis(
