@@ -57,9 +57,10 @@ def _worst_run_chart(study: Study) -> Chart:
     ratio = runs.worst[: len(k)] / (study.rate**k * start + study.error_bound)
     last = int(np.flatnonzero(ratio >= SMALLEST_RATIO)[-1])
     k = k[: max(last + 2, SOJOURNS_DRAWN * sojourn)]
+    claim = _claim(start, study.error_bound)
     time_s, ratio = k * study.step_s, ratio[: len(k)]
     lines = [
-        Line(_claim(start, study.error_bound), time_s, np.ones(len(k)), reference=True),
+        Line(claim, time_s, np.ones(len(k)), reference=True),
         Line(f"what may happen between, {growth:.3g} times that", time_s, np.full(len(k), growth)),
         Line("mean error", time_s, _drawable(ratio)),
     ]
@@ -71,7 +72,7 @@ def _worst_run_chart(study: Study) -> Chart:
         "time, s",
         (
             Panel(
-                "norm of the mean error,\nas a multiple",
+                f"mean error's norm over\n{claim}",
                 lines,
                 marks=[Mark("a switch is noticed", x=time) for time in noticed.tolist()],
                 log_y=True,
