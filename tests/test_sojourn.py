@@ -988,6 +988,8 @@ def test_condition_7_says_by_what_it_is_judged(figure_2a):
     assert "0.271 of the stays in slow" in flown["remark"]
     drawn = rows(findings("sojourn_fig2b", f"{KEY}simulated_runs=10").tables["conditions"], "asks")
     assert drawn["sojourn long enough"]["remark"].startswith("judged by the modes' chain: by the")
+    shown = scalar((0.0, 1.0), (0.0, 2.0)).tables["conditions"].shown
+    assert shown["by"][6] == "1 step; none of the chain's is less"
 
 
 def test_unmet_conditions_say_so_by_their_number():

@@ -264,6 +264,7 @@ def _condition_7(study: Study) -> _Condition:
         return _Condition(asks, False, sojourn, what, "infeasible", "no sojourn is")
     if len(study.names) == 1:
         return _Condition(asks, True, sojourn, what, "nothing switches", "nothing switches")
+    asked = f"{sojourn:.0f} {plural('step', sojourn)}"
     short = study.too_short_probability
     worst = int(np.argmax(short))
     by_chain = (
@@ -277,7 +278,9 @@ def _condition_7(study: Study) -> _Condition:
             sojourn,
             what,
             f"judged by the modes' chain: {by_chain}",
-            f"{sojourn:.0f} steps; {100 * short[worst]:.3g} % of the chain's are less",
+            f"{asked}; {100 * short[worst]:.3g} % of the chain's are less"
+            if short[worst] > 0.0
+            else f"{asked}; none of the chain's is less",
         )
     mode, steps = study.flown
     return _Condition(
@@ -286,7 +289,7 @@ def _condition_7(study: Study) -> _Condition:
         sojourn,
         what,
         f"judged by the flight, whose shortest stay, in {mode}, lasts {steps} steps; {by_chain}",
-        f"{sojourn:.0f} steps; the flight's last {steps} or more",
+        f"{asked}; the flight's last {steps} or more",
     )
 
 

@@ -358,7 +358,8 @@ def _simulate(
     longest = round(direct.steps)
     steps, why = _run_length(settings, longest + delay)
     if steps <= longest + delay:  # no run would come to a switch
-        return (), (f"nothing is simulated, since a sojourn of {longest + delay} steps {why}",)
+        asked = f"{longest + delay} {plural('step', longest + delay)}"
+        return (), (f"nothing is simulated, since a sojourn of {asked} {why}",)
     claimed = Claimed(rate, error_bound, max(direct.growth))
     # Every second run starts without an error where a delay leaves one: M0 alone is its bound then.
     start = np.full(settings.simulated_runs, 10.0 * error_bound or 1.0)
