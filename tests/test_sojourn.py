@@ -26,6 +26,7 @@ from hybridtrack.analyses._sojourn_bounds import (
     mismatch,
     printed_bound,
     rate_correct_bound,
+    state_effects,
 )
 from hybridtrack.analyses._sojourn_charts import charts
 from hybridtrack.analyses._sojourn_numbers import number
@@ -291,6 +292,10 @@ def test_the_1_norm_bounds_no_entry():
     assert found.printed == 1
     assert found.infinity == 3
     assert found.euclidean == pytest.approx(3)
+    # With inputs the second bounds more, and what the states add of it is what it was.
+    driven = Mismatch(effect, np.full((2, 2, 3), 5.0))
+    assert disturbance_bounds(driven, StateBound(np.ones(3), 9.0)).infinity == 3 + 5
+    assert state_effects(driven, 1.0) == (1, 3)
 
 
 # ---- the bounds' promises --------------------------------------------------------------------
