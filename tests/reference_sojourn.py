@@ -104,4 +104,4 @@ def output_covariance(A, C, Q, R, second_moment, steps):
             block = C @ np.linalg.matrix_power(A, t - 1 - s)
             T[t * p : (t + 1) * p, s * n : (s + 1) * n] = block
     noise = T @ np.kron(np.eye(steps), Q) @ T.T + np.kron(np.eye(steps), R)
-    return O @ second_moment @ O.T + noise
+    return O @ np.atleast_2d(second_moment) @ O.T + noise

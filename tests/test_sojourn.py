@@ -1,7 +1,9 @@
 """How long a mode must last: the paper's example, what is wrong in it, and the bounds' promises."""
 
 import itertools
+import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -24,12 +26,16 @@ from hybridtrack.analyses._sojourn_bounds import (
     mismatch,
     printed_bound,
     rate_correct_bound,
+    state_effects,
 )
+from hybridtrack.analyses._sojourn_charts import charts
+from hybridtrack.analyses._sojourn_numbers import number
 from hybridtrack.analyses._sojourn_observability import joint_observability
 from hybridtrack.analyses._switching_runs import Claimed, switching_runs
-from hybridtrack.analyses.sojourn import ANALYSIS, Settings, sojourn_study
+from hybridtrack.analyses.sojourn import ANALYSIS, Settings, _second_moment, sojourn_study
 from hybridtrack.config import ScenarioError, load, shipped
 from hybridtrack.errors import Unsuited, UserError
+from hybridtrack.tables import LONG_TEXT
 from models import figure_5_model, random_model
 
 PRINTED = 1e-4  # relative: the figures are held to this; four digits or more were noted
@@ -131,7 +137,10 @@ def test_seven_conditions_of_the_papers_example(figure_2a):
     said = " ".join(figure_2a.conclusions)
     assert "4 steps (8 s)" in said
     assert "Condition 1 isn't met, by the paper's own Lemma 3" in said
-    assert "1-norm" in " ".join(figure_2a.notes)
+    assert "2.262 times what it shall be, in 'slow'" in said
+    noted = " ".join(figure_2a.notes)
+    assert "no bound in general; of what the states add it is 17.71, and by the" in noted
+    assert "2.262 times that at most between" in noted
 
 
 def test_random_switching_breaks_the_claim_below_4_steps_alone(figure_2a):
@@ -157,10 +166,39 @@ def test_the_envelope_stands_beside_the_claim_in_the_chart(figure_2a):
     _, chart = figure_2a.charts
     (panel,) = chart.panels
     claim, envelope, error = panel.lines
-    np.testing.assert_allclose(claim.y, 0.99 ** np.arange(len(claim.y)), rtol=ROUNDING)
-    np.testing.assert_allclose(envelope.y / claim.y, 2.261678, rtol=PRINTED)
+    assert claim.label == "mu^k"
+    assert (claim.y == 1).all()
+    np.testing.assert_allclose(envelope.y, 2.261678, rtol=PRINTED)
     assert (error.y > claim.y).any()
     assert (error.y <= envelope.y).all()
+    assert panel.y_limits[0] == 1e-3
+    # It starts at what is claimed of it, and switches are marked within what is drawn.
+    assert error.y[0] == 1
+    assert {mark.label for mark in panel.marks} == {"a switch is noticed"}
+    times = [mark.x for mark in panel.marks]
+    assert min(np.diff([0.0, *times])) >= 8
+    assert max(times) <= error.x[-1]
+
+
+def test_an_error_bound_is_part_of_what_the_worst_run_is_held_against():
+    asked = [*FIGURE_2A, f"{KEY}decision_delay_steps=1", f"{KEY}error_bound=20"]
+    found = study(*asked)
+    _, chart = charts(found)
+    claim, _, error = chart.panels[0].lines
+    _, runs = found.simulated[-1]
+    start = runs.worst[0]
+    assert start == 200
+    assert claim.label == "mu^k ||e0|| + M0"
+    k = np.arange(len(error.y))
+    np.testing.assert_allclose(error.y * (0.99**k * start + 20), runs.worst[k], rtol=ROUNDING)
+
+
+def test_curves_that_lie_on_one_another_are_drawn_once():
+    """Of a scalar ||F^t|| is k alpha^t, and both modes are one."""
+    chart = scalar((0.9, 1.0), (0.9, 1.0)).charts[0]
+    labels = [line.label for line in chart.panels[0].lines]
+    assert labels == ["mu^t", "slow = slow, k alpha^t = fast = fast, k alpha^t"]
+    assert len(scalar((0.9, 1.0), (0.5, 1.0)).charts[0].panels[0].lines) == 3
 
 
 def test_the_largest_delay_that_condition_6_allows():
@@ -254,6 +292,10 @@ def test_the_1_norm_bounds_no_entry():
     assert found.printed == 1
     assert found.infinity == 3
     assert found.euclidean == pytest.approx(3)
+    # With inputs the second bounds more, and what the states add of it is what it was.
+    driven = Mismatch(effect, np.full((2, 2, 3), 5.0))
+    assert disturbance_bounds(driven, StateBound(np.ones(3), 9.0)).infinity == 3 + 5
+    assert state_effects(driven, 1.0) == (1, 3)
 
 
 # ---- the bounds' promises --------------------------------------------------------------------
@@ -360,8 +402,15 @@ def test_a_deadbeat_filter_needs_as_many_steps_as_its_chain_is_long():
 
 
 def test_a_bound_beyond_all_measure_says_so():
-    with pytest.raises(UserError, match="mode 'm0' would have to last more than 50000 steps"):
+    why = (
+        "mode 'm0' would have to last more than 50000 steps: it decays at 0.9899999 per step, and "
+        "'convergence_rate' is 0.99; choose it further above that"
+    )
+    with pytest.raises(UserError, match=re.escape(why)):
         direct([np.array([[0.9899999, 1e4], [0.0, 0.9]])])
+    why = "it decays at 0.9999 per step, and the delay adds up to 1, where 'error_bound' is 1.001;"
+    with pytest.raises(UserError, match=re.escape(why)):
+        direct([[[0.9999]]], 1.0, 0.99999, 1.001, 1)
 
 
 # ---- eigenvalues -----------------------------------------------------------------------------
@@ -553,6 +602,28 @@ def test_noise_alone_tells_two_modes_apart_that_no_rank_does():
     assert not told.met
 
 
+def test_lemma_2_may_need_one_output_more_than_the_recursions_order():
+    """One state, decaying by .9 or by .5, started at exactly 0: the third output tells."""
+    model = random_model(np.random.default_rng(14), n_modes=2, n_x=1, n_y=1)
+    model = model._replace(
+        state_transition=np.array([0.9, 0.5]).reshape(1, 2, 1, 1),
+        process_noise_covariance=np.ones((1, 2, 1, 1)),
+        measurement_matrix=np.ones((2, 1, 1)),
+        measurement_noise_covariance=np.ones((2, 1, 1)),
+    )
+    alike = [
+        np.allclose(
+            *(
+                slow.output_covariance(A, np.eye(1), np.eye(1), np.eye(1), 0.0, steps)
+                for A in (np.array([[0.9]]), np.array([[0.5]]))
+            )
+        )
+        for steps in (1, 2, 3)
+    ]
+    assert alike == [True, True, False]
+    assert joint_observability(model, np.zeros((1, 1))).covariance_steps == 3
+
+
 # ---- the simulation --------------------------------------------------------------------------
 
 
@@ -576,7 +647,7 @@ def test_the_simulation_is_what_a_run_by_run_one_gives():
     Fs = [one.transition for one in study(*FIGURE_2A).filters]
     Fs.append(Fs[0] @ Fs[1])
     for sojourn in (1, 2):
-        ours = simulated(Fs, Claimed(0.99, 0.0, 1.0, 0.0), sojourn_steps=sojourn).at_switches
+        ours = simulated(Fs, Claimed(0.99, 0.0, 1.0), sojourn_steps=sojourn).at_switches
         runs, rng = 1000, np.random.default_rng(5)
         theirs = slow.share_that_breaks_the_claim(Fs, 0.99, sojourn, 2, runs, 60, rng)
         error = math.sqrt(theirs * (1 - theirs) * (1 / runs + 1 / 2000))
@@ -598,11 +669,11 @@ def test_no_run_breaks_the_direct_bound(seed, delay):
     bound = direct(Fs, U, 0.95, 1.2 * c, delay)
     found = simulated(
         Fs,
-        Claimed(0.95, 1.2 * c, max(bound.growth), c),
+        Claimed(0.95, 1.2 * c, max(bound.growth)),
         effect=effect,
         sojourn_steps=int(bound.steps) + delay,
         delay_steps=delay,
-        start=1e3 * c or 1.0,
+        start=np.tile([1e3 * c, 10 * c, 0.0, 0.0], 500) if c else 1.0,
         steps=250,
     )
     assert found.at_switches == 0
@@ -616,7 +687,7 @@ def test_what_the_paper_claims_of_steps_between_fails_and_what_is_printed_is_too
     F = np.array([[0.98, 0.0], [0.0, 0.5]])
     found = simulated(
         [F, F],
-        Claimed(0.99, 1.5, 1.0, 0.0),
+        Claimed(0.99, 1.5, 1.0),
         effect=np.tile(np.eye(2), (2, 2, 1, 1)),
         sojourn_steps=2,
         extra_steps=0,
@@ -625,6 +696,69 @@ def test_what_the_paper_claims_of_steps_between_fails_and_what_is_printed_is_too
         steps=300,
     )
     assert found.at_switches > 0.5
+
+
+def test_the_envelope_is_as_near_as_it_can_be():
+    """Of three quarters of the growth a fair share of runs is over, of all of it none."""
+    Fs = [one.transition for one in study(*FIGURE_2A).filters]
+    growth = max(direct(Fs).growth)
+    over = [
+        simulated(Fs, Claimed(0.99, 0.0, share * growth), sojourn_steps=4).over_envelope
+        for share in (0.75, 1.0)
+    ]
+    assert over[0] > 0.1
+    assert over[1] == 0
+
+
+def test_what_a_delay_adds_does_not_widen_the_envelope():
+    """A filter that never lets an error grow has the claim itself for an envelope."""
+    F = np.array([[0.98]])
+    effect = np.ones((2, 2, 1, 1))
+    too_short = simulated(
+        [F, F],
+        Claimed(0.99, 1.5, 1.0),
+        effect=effect,
+        sojourn_steps=2,
+        extra_steps=0,
+        delay_steps=1,
+        start=15.0,
+        steps=300,
+    )
+    assert too_short.over_envelope == too_short.between > 0.1
+
+
+def test_m0_is_held_against_errors_that_come_of_the_delay_alone():
+    """From 10 M0 no error would pass mu^t e_0 + M0 at these switches: mu^t alone hides them."""
+    F = np.array([[0.9]])
+    bound = direct([F, F], 1.0, 0.999, 1.05, 1)
+    assert bound.steps == 29  # 1 / (1 - .9^29) <= 1.05
+
+    def share(sojourn, start):
+        found = simulated(
+            [F, F],
+            Claimed(0.999, 1.05, 1.0),
+            effect=np.ones((2, 2, 1, 1)),
+            sojourn_steps=sojourn,
+            extra_steps=0,
+            delay_steps=1,
+            start=start,
+            steps=400,
+        )
+        return found.at_switches
+
+    assert share(30, 0.0) == share(30, 10.5) == share(20, 10.5) == 0
+    assert share(20, 0.0) > 0.5
+
+
+def test_half_of_the_runs_start_without_an_error_where_one_may_remain():
+    """M0 = 11.5, a little above c = 11.42, asks for 12 steps; 8 are too few, which those show."""
+    asked = [*FIGURE_2A, f"{KEY}decision_delay_steps=1", f"{KEY}error_bound=11.5"]
+    found = dict(study(*asked, f"{KEY}simulated_runs=400").simulated)
+    assert found[8].at_switches > 0.05
+    assert found[12].at_switches == 0
+    assert any(
+        "every second simulated run starts without" in note for note in findings(*asked).notes
+    )
 
 
 # ---- any scenario ----------------------------------------------------------------------------
@@ -640,10 +774,10 @@ def check(found):
             assert kinds <= {float, int, bool, str}
             assert not any(isinstance(cell, float) and math.isnan(cell) for cell in column)
         widths = [
-            max(len(line) for line in (*head.split("\n"), *cells))
+            max(min(len(line), LONG_TEXT) for line in (*head.split("\n"), *cells))
             for head, cells in table.shown.items()
         ]
-        assert sum(widths) + 2 * (len(widths) - 1) <= 80
+        assert sum(widths) + 3 * (len(widths) - 1) <= 80
     assert 1 <= len(found.conclusions) <= 4
     assert len(found.charts) <= 2
     for chart, panel in itertools.product(found.charts, range(1)):
@@ -706,6 +840,10 @@ def test_what_can_be_asked_is_answered(asked):
             ["sojourn_fig2a", f"{KEY}convergence_rate=0.55"],
             r"mode 'sharp' decays at 0\.5567 per step: choose 'convergence_rate' above it",
         ),
+        (
+            ["sojourn_fig2a", f"{KEY}convergence_rate=0.556665"],
+            r"mode 'sharp' decays at 0\.55667 per step: .* \(it is 0\.556665\)",
+        ),
         (["sojourn_fig2a", f"{KEY}decision_delay_steps=-1"], "at least 0"),
         (["sojourn_fig2a", f"{KEY}decision_delay_steps=0.5"], "whole number"),
         (["sojourn_fig2a", f"{KEY}state_bound=[1, 2]"], "2 numbers; give one, or one for each"),
@@ -764,6 +902,112 @@ def test_settings_are_checked_without_a_scenario_too():
             sojourn_study(experiment, settings)
 
 
+SCALAR = {
+    "truth": {"chain": {"initial": {"mean": [0], "covariance": [[1]]}}},
+    "states": ["x"],
+    "initial": {"mean": [0], "covariance": [[1]]},
+    "transition_matrix": [[0.9, 0.1], [0.1, 0.9]],
+    "estimators": {"IMM": {"type": "imm"}},
+    "compare_with": None,
+    "dimensions": 1,
+}
+
+
+def scalar(slow_mode, fast_mode, **sojourn):
+    """Findings of two modes of one state each, which is measured; A and its noise."""
+    modes = {
+        name: {"state_transition": [[A]], "process_noise_covariance": [[Q]]}
+        for name, (A, Q) in (("slow", slow_mode), ("fast", fast_mode))
+    }
+    asked = SCALAR | {"modes": modes, "analyses": {"sojourn": {"simulated_runs": 10} | sojourn}}
+    return findings(
+        "sojourn_fig2a", *(f"{key}={json.dumps(value)}" for key, value in asked.items())
+    )
+
+
+def test_what_is_no_different_is_not_told():
+    """Scalars don't grow between switches, and of a 1 x 1 matrix all norms are one."""
+    found = scalar((0.9, 1.0), (0.5, 1.0), state_bound=[10])
+    noted = " ".join([*found.notes, *found.conclusions])
+    assert "1-norm" not in noted
+    assert "between" not in noted
+    assert "may grow" not in noted
+
+
+def test_large_numbers_are_alike_in_tables_and_sentences():
+    """ln(1 - c/M0) / ln alpha of a filter that decays slowly, in thousands of steps."""
+    found = scalar(
+        (0.9999, 1e-8), (0.9995, 1e-8), convergence_rate=0.99999, decision_delay_steps=1,
+        state_bound=[100], error_bound=0.045,
+    )  # fmt: skip
+    (steps,) = (
+        row["minimum_sojourn_steps"]
+        for row in rows(found.table, "bound").values()
+        if row["bound"] == "direct"
+    )
+    assert steps > 10_000
+    assert found.table.shown["sojourn\nsteps"][2] == f"{steps:.0f}"
+    assert f"at least {steps:.0f} steps" in found.conclusions[0]
+    assert "the factor 0.99999 per step" in found.conclusions[0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"simulated_steps": 2}, "fills a run of 2: raise 'simulated_steps'"),
+        ({"simulated_runs": 100_000, "simulated_steps": 3}, "fills a run of 3: raise"),
+        ({"simulated_runs": 10**5, "decision_delay_steps": 60}, "of 50, as long as 100000 can be"),
+        ({"decision_delay_steps": 5000}, "fills a run of 5000, as long as one gets by itself"),
+        ({"convergence_rate": 1e-25, "decision_delay_steps": 8}, "the 8 after which 1e-25^t"),
+    ],
+)
+def test_why_nothing_is_simulated(asked, why):
+    model = (0.0, 1.0), (0.0, 2.0)
+    found = scalar(*model, **({"decision_delay_steps": 3} | asked))
+    assert "simulation" not in found.tables
+    assert any(why in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("value", "others", "text"),
+    [
+        (17.7071, (), "17.71"),
+        (10001.4, (), "10001"),
+        (123456789.0, (), "123456789"),
+        (1e12, (), "1e+12"),
+        (0.9999999, (1.0,), "0.9999999"),
+        (0.99004, (1.0, 0.99), "0.99004"),
+        (1.5, (1.5,), "1.5"),
+        (math.inf, (1.0,), "inf"),
+    ],
+)
+def test_as_many_digits_as_it_takes(value, others, text):
+    assert number(value, *others) == text
+
+
+def test_condition_7_says_by_what_it_is_judged(figure_2a):
+    flown = rows(figure_2a.tables["conditions"], "condition")[7]
+    assert flown["remark"].startswith(
+        "judged by the flight, whose shortest stay, in slow, lasts 10"
+    )
+    assert "0.271 of the stays in slow" in flown["remark"]
+    drawn = rows(findings("sojourn_fig2b", f"{KEY}simulated_runs=10").tables["conditions"], "asks")
+    assert drawn["sojourn long enough"]["remark"].startswith("judged by the modes' chain: by the")
+    shown = scalar((0.0, 1.0), (0.0, 2.0)).tables["conditions"].shown
+    assert shown["by"][6] == "1 step; none of the chain's is less"
+
+
+def test_unmet_conditions_say_so_by_their_number():
+    """Two axes alike repeat every eigenvalue; a delay of 2 is over eq. 39's 1.431."""
+    asked = [*FIGURE_2A, f"{KEY}error_bound=200", f"{KEY}decision_delay_steps=2"]
+    shown = findings(*asked).tables["conditions"].shown
+    assert shown["by"][5] == "2 steps, eq. 39 allows 1.431"
+    shown = findings("rmimm_fig5", f"{KEY}simulated_runs=10").tables["conditions"].shown
+    assert shown["condition"][3].startswith("4 ")
+    assert shown["met"][3] == "no"
+    assert "repeated eigenvalues in" in shown["by"][3]
+
+
 def test_one_mode_switches_nowhere():
     experiment = load("sojourn_fig2a")
     alone = experiment._replace(
@@ -783,6 +1027,83 @@ def test_stays_that_are_too_short_by_an_asymmetric_chain():
     found = study(*FIGURE_2A, "transition_matrix=[[0.9, 0.1], [0.4, 0.6]]")
     np.testing.assert_allclose(found.too_short_probability, [1 - 0.9**3, 1 - 0.6**3])
     assert found.flown == ("slow", 10)
+
+
+LEG = "{until_s: 200, turn_rate_deg_s: 2, mode: slow}"
+
+
+@pytest.mark.parametrize(
+    "legs",
+    [
+        f"[{LEG}]",
+        "[{until_s: 100, mode: slow}, {until_s: 200, turn_rate_deg_s: 2, mode: slow}]",
+        "[{until_s: 100}, {until_s: 200, turn_rate_deg_s: 2}]",
+    ],
+)
+def test_a_flight_that_never_switches_has_no_shortest_stay(legs):
+    assert study(*FIGURE_2A, f"truth.legs={legs}").flown is None
+    check(findings(*FIGURE_2A, f"truth.legs={legs}"))
+
+
+STRAIGHT = np.kron(np.eye(2), [[1.0, 2.0], [0.0, 1.0]]).tolist()
+NOISE = np.eye(4).tolist()
+
+
+def test_one_mode_flown_on_two_legs():
+    asked = {
+        "truth.legs": "[{until_s: 100, mode: slow}, {until_s: 200, mode: slow}]",
+        "modes": f"{{slow: {{state_transition: {STRAIGHT}, process_noise_covariance: {NOISE}}}}}",
+        "transition_matrix": "[[1]]",
+        "initial.mode_probabilities": "{slow: 1}",
+        "estimators": "{KF: {type: kalman, mode: slow}}",
+        "compare_with": "null",
+    }
+    found = findings(*FIGURE_2A, *(f"{key}={value}" for key, value in asked.items()))
+    assert "one mode" in found.conclusions[0]
+    check(found)
+
+
+def without_reference(experiment, unknown=slice(None)):
+    """The scenario with a truth that isn't known at the given steps."""
+    (case,) = experiment.cases
+    state = case.truth.state.copy()
+    state[unknown] = math.nan
+    truth = case.truth._replace(state=state)
+    return experiment._replace(cases=(case._replace(truth=truth),))
+
+
+def test_a_truth_that_is_not_known_bounds_nothing():
+    experiment = without_reference(load("sojourn_fig2a"))
+    settings = Settings(simulated_runs=10)
+    found = ANALYSIS.analyse(experiment, settings, None)
+    assert rows(found.table, "bound")["direct"]["disturbance"] is None
+    assert rows(found.tables["conditions"], "condition")[5]["met"] is None
+    said = " ".join(found.notes)
+    assert "the flight itself has" not in said
+    assert "taken as 0, since the truth isn't known" in said
+    late = settings._replace(decision_delay_steps=1, error_bound=20.0)
+    with pytest.raises(UserError, match="how large vx and vy may be; add 'state_bound'"):
+        ANALYSIS.analyse(experiment, late, None)
+
+
+def test_a_truth_with_gaps_bounds_by_what_is_known():
+    whole, gaps = load("sojourn_fig2a"), without_reference(load("sojourn_fig2a"), slice(3, 20))
+    settings = Settings(simulated_runs=10)
+    one, other = (sojourn_study(each, settings) for each in (whole, gaps))
+    assert other.disturbance.euclidean == pytest.approx(one.disturbance.euclidean, rel=1e-3)
+    assert any("the flight itself has, where it is known" in note for note in other.notes)
+
+
+def test_the_start_of_a_filter_about_the_truth_has_its_covariance():
+    """Pi_0 = x x' + P, with x the truth's and P the filters'."""
+    start = "truth.start={position_m: [3, -2], speed_kt: 0, heading_deg: 0}"
+    experiment = load("sojourn_fig2a", [start])
+    model = study(*FIGURE_2A).model
+    moment, (said,) = _second_moment(experiment, model)
+    expected = np.diag([1.0, 100.0, 1.0, 100.0])  # of positions 1 m, of velocities 10 m/s
+    expected += np.outer([3, 0, -2, 0], [3, 0, -2, 0])
+    np.testing.assert_allclose(moment, expected, rtol=ROUNDING)
+    assert said.endswith("is that of the truth")
 
 
 def test_the_same_seed_gives_the_same_findings():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hybridtrack.analyses._eigenstructure import Eigenstructure, power_bound, steps_until_below
 from hybridtrack.analyses._predictor_filters import PredictorFilter
+from hybridtrack.analyses._sojourn_numbers import as_set, number
 from hybridtrack.errors import Unsuited
 from hybridtrack.models import Array, JumpMarkovModel
 
@@ -77,7 +78,7 @@ def disturbance_bounds(mismatch: Mismatch, state: StateBound) -> DisturbanceBoun
     X = float(state.each[counts].max(initial=0.0))
     printed = infinity = None
     if math.isfinite(X):
-        printed = float(np.abs(effect).sum(axis=-2).max(initial=0.0)) * X
+        printed, _ = state_effects(mismatch, X)
         rows = np.abs(effect).sum(axis=-1).max(axis=-1) * X + np.abs(inputs).max(axis=-1)
         infinity = float(rows.max())
     largest = max(
@@ -87,6 +88,13 @@ def disturbance_bounds(mismatch: Mismatch, state: StateBound) -> DisturbanceBoun
         )
     )
     return DisturbanceBounds(printed, infinity, largest if math.isfinite(largest) else None)
+
+
+def state_effects(mismatch: Mismatch, largest_state: float) -> tuple[float, float]:
+    """The largest 1-norm and the largest infinity norm of the state effects, times X."""
+    sizes = np.abs(mismatch.state_effect)
+    columns, rows = (float(sizes.sum(axis=axis).max(initial=0.0)) for axis in (-2, -1))
+    return columns * largest_state, rows * largest_state
 
 
 def _largest_norm(effect: Array, offset: Array, each: Array, norm: float) -> float:
@@ -254,9 +262,29 @@ def direct_bound(
     those. Raises Unsuited where L is over LONGEST_STEPS.
     """
     norms = PowerNorms(transitions, convergence_rate)
-    decay_by_mode = [
-        _last_above(norms, m, lambda t: np.ones(len(t)), names[m]) for m in range(len(transitions))
-    ]
+    alphas = [float(np.abs(np.linalg.eigvals(F)).max()) for F in transitions]
+
+    def last_above(limit: Callable[[Array], Array], key: str, why: str) -> list[int]:
+        found = []
+        for mode, name in enumerate(names):
+            steps = _last_above(norms, mode, limit)
+            if steps is None:
+                decays = f"it decays at {number(alphas[mode], 1.0, convergence_rate)} per step"
+                raise Unsuited(
+                    f"mode '{name}' would have to last more than {LONGEST_STEPS} steps: {decays}, "
+                    f"{why}",
+                    "analyses",
+                    "sojourn",
+                    key,
+                )
+            found.append(steps)
+        return found
+
+    decay_by_mode = last_above(
+        lambda t: np.ones(len(t)),
+        "convergence_rate",
+        f"and 'convergence_rate' is {as_set(convergence_rate)}; choose it further above that",
+    )
     decay = max(1, *decay_by_mode)
     known = norms.until(max(decay, 1))
     growth = tuple(float(column.max()) for column in known.T)
@@ -273,12 +301,13 @@ def direct_bound(
         repair = math.inf
         allowed = 1.0 - delay_error / error_bound if error_bound > 0 else -1.0
         if allowed > 0.0 or (allowed == 0.0 and largest == 0.0):
-            repair = float(
-                max(
-                    _last_above(norms, m, lambda t: _over(allowed, convergence_rate, t), names[m])
-                    for m in range(len(transitions))
-                )
+            by_mode = last_above(
+                lambda t: _over(allowed, convergence_rate, t),
+                "error_bound",
+                f"and the delay adds up to {number(delay_error, error_bound)}, where 'error_bound' "
+                f"is {as_set(error_bound)}; choose it further above that",
             )
+            repair = float(max(by_mode))
     return DirectBound(decay, repair, delay_error, at_decay, growth, tuple(decay_by_mode))
 
 
@@ -294,8 +323,11 @@ def _over(allowed: float, rate: float, t: Array) -> Array:
         return allowed / rate**t
 
 
-def _last_above(norms: PowerNorms, mode: int, limit: Callable[[Array], Array], name: str) -> int:
-    """The smallest L from which on the norms of a mode are at most limit(t), which never falls."""
+def _last_above(norms: PowerNorms, mode: int, limit: Callable[[Array], Array]) -> int | None:
+    """The smallest L from which on the norms of a mode are at most limit(t), which never falls.
+
+    None where it is over LONGEST_STEPS.
+    """
     steps = 64
     while True:
         t = np.arange(float(steps))
@@ -304,12 +336,5 @@ def _last_above(norms: PowerNorms, mode: int, limit: Callable[[Array], Array], n
         if 2 * first <= steps:
             return first
         if first > LONGEST_STEPS:
-            raise Unsuited(
-                f"mode '{name}' would have to last more than {LONGEST_STEPS} steps; choose "
-                "'convergence_rate' (or 'error_bound') under analyses.sojourn further above what "
-                "it can keep",
-                "analyses",
-                "sojourn",
-                "convergence_rate",
-            )
+            return None
         steps *= 2

@@ -60,7 +60,9 @@ def joint_observability(model: JumpMarkovModel, second_moment: Array) -> JointOb
             for pair in pairs
         )
 
-    most = n * (n + 1)  # the covariances of two modes' states obey one recursion of this order
+    # The covariances of two modes' states obey one recursion of order n (n + 1), to which Q adds a
+    # constant: outputs that are alike so often and once more are alike for ever.
+    most = n * (n + 1) + 1
 
     def apart(one: ModeDynamics, other: ModeDynamics) -> int | None:
         return _first(range(1, most + 1), lambda steps: initial_mode_test(one, other, steps).differ)

@@ -9,6 +9,7 @@ import numpy as np
 from hybridtrack.analyses._eigenstructure import steps_until_below
 from hybridtrack.analyses._findings import Table
 from hybridtrack.analyses._sojourn_bounds import PaperBound
+from hybridtrack.analyses._sojourn_numbers import number
 from hybridtrack.analyses._sojourn_observability import JointObservability
 from hybridtrack.analyses._sojourn_study import Study
 from hybridtrack.analyses._sojourn_words import listed, pairs, plural
@@ -87,7 +88,8 @@ def _reasons(study: Study) -> list[str]:
             assert bound.delay_error is not None
             comparison = "above" if bound.delay_error > study.error_bound else "no less than"
             found.append(
-                f"infeasible: the delay adds {bound.delay_error:.4g}, {comparison} error_bound"
+                f"infeasible: the delay adds {number(bound.delay_error, study.error_bound)}, "
+                f"{comparison} error_bound"
                 if name != "printed"
                 else "infeasible"
             )
@@ -100,6 +102,7 @@ class _Condition(NamedTuple):
     figure: float | None
     what: str  # the figure is
     remark: str
+    shown: str  # figure and remark in a few words
 
 
 def conditions_table(study: Study) -> Table:
@@ -124,14 +127,9 @@ def conditions_table(study: Study) -> Table:
     return Table(
         columns,
         {
-            "condition": [str(i) for i in columns["condition"]],
-            "asks": columns["asks"],
+            "condition": [f"{i} {row.asks}" for i, row in enumerate(rows, start=1)],
             "met": [{True: "yes", False: "no", None: "unknown"}[met] for met in columns["met"]],
-            "figure": [
-                _cell(row.figure, "any" if row.what.startswith("largest delay") else "never")
-                for row in rows
-            ],
-            "which is": columns["figure_is"],
+            "by": [row.shown for row in rows],
         },
     )
 
@@ -156,26 +154,40 @@ def _condition_1(told: JointObservability) -> _Condition:
     else:
         remarks.append(f"noise apart, the joint observability index is {told.joint_index}")
     steps = told.covariance_steps
+    first = "Lemma 2 fails" if steps is None else f"Lemma 2 after {steps} {plural('output', steps)}"
     return _Condition(
         "modes told apart",
         told.met,
         math.inf if steps is None else float(steps),
         "outputs, Lemma 2",
         "; ".join(remarks),
+        f"{first}, Lemma 3 {'fails' if told.unseen_switches else 'holds'}",
     )
 
 
 def _condition_2(study: Study) -> _Condition:
     lost = [one.mode for one in study.filters if not one.observable]
     remark = f"not of {listed(lost)}, but detectable, which Theorem 2 asks" if lost else ""
-    return _Condition("{A, C} observable", not lost, float(len(lost)), "modes that aren't", remark)
+    return _Condition(
+        "{A, C} observable",
+        not lost,
+        float(len(lost)),
+        "modes that aren't",
+        remark,
+        f"not of {listed(lost)}" if lost else "all modes",
+    )
 
 
 def _condition_3(study: Study) -> _Condition:
     lost = [one.mode for one in study.filters if not one.controllable]
     remark = f"not of {listed(lost)}, but on the unit circle, which Theorem 2 asks" if lost else ""
     return _Condition(
-        "{A, Q^1/2} controllable", not lost, float(len(lost)), "modes that aren't", remark
+        "{A, Q^1/2} controllable",
+        not lost,
+        float(len(lost)),
+        "modes that aren't",
+        remark,
+        f"not of {listed(lost)}" if lost else "all modes",
     )
 
 
@@ -188,7 +200,8 @@ def _condition_4(study: Study) -> _Condition:
         for name, one in zip(study.names, study.structures, strict=True)
         if one.largest_block > 1
     }
-    remark = "all are stable"
+    alpha = max(one.rate for one in study.structures)
+    remark, shown = "all are stable", f"alpha at most {number(alpha, 1.0)}"
     if repeated:
         remark += f"; eigenvalues repeat in {listed(repeated)}"
         remark += (
@@ -196,13 +209,8 @@ def _condition_4(study: Study) -> _Condition:
             if blocks
             else ", with eigenvectors enough, so eq. 29 holds all the same"
         )
-    return _Condition(
-        "F stable, distinct",
-        not repeated,
-        max(one.rate for one in study.structures),
-        "largest alpha",
-        remark,
-    )
+        shown += f"; repeated eigenvalues in {listed(repeated)}"
+    return _Condition("F stable, distinct", not repeated, alpha, "largest alpha", remark, shown)
 
 
 def _condition_5(study: Study) -> _Condition:
@@ -214,15 +222,17 @@ def _condition_5(study: Study) -> _Condition:
             None,
             "U",
             "the states that count have no known bound; add state_bound under analyses.sojourn",
+            "no bound of a state that counts",
         )
     assert bound.printed is not None
     if bound.printed == 0.0 and bound.infinity == 0.0:
         remark = "the modes differ in noise alone, if at all: a wrong filter adds no error"
-        return _Condition("bound U", True, 0.0, "U, infinity norm", remark)
-    remark = f"as printed, by the 1-norm, {bound.printed:.4g}, which is no bound"
+        return _Condition("bound U", True, 0.0, "U, infinity norm", remark, "0")
+    remark = f"as printed, by the 1-norm, {number(bound.printed)}, which is no bound in general"
     if bound.euclidean is not None:
-        remark += f"; of the 2-norm {bound.euclidean:.4g}"
-    return _Condition("bound U", True, bound.infinity, "U, infinity norm", remark)
+        remark += f"; of the 2-norm {number(bound.euclidean)}"
+    shown = f"{number(bound.infinity)}, infinity norm"
+    return _Condition("bound U", True, bound.infinity, "U, infinity norm", remark, shown)
 
 
 def _condition_6(study: Study) -> _Condition:
@@ -239,31 +249,47 @@ def _condition_6(study: Study) -> _Condition:
     corrected, printed = allowed(study.disturbance.infinity), allowed(study.disturbance.printed)
     remark = "" if printed is None else f"as printed, {_cell(printed, 'any number of')} steps"
     met = True if delay == 0 else None if corrected is None else delay <= corrected
-    return _Condition("delay short enough", met, corrected, "largest delay, steps", remark)
+    shown = f"{delay} {plural('step', delay)}"
+    if delay and corrected is not None:
+        shown += f", eq. 39 allows {_cell(corrected, 'any', delay)}"
+    elif delay:
+        shown += ", and U isn't known"
+    return _Condition("delay short enough", met, corrected, "largest delay, steps", remark, shown)
 
 
 def _condition_7(study: Study) -> _Condition:
-    sojourn = study.direct_sojourn
+    """Judged by the flight's stays, where it has any that end; else by those of the chain."""
+    sojourn, asks, what = study.direct_sojourn, "sojourn long enough", "steps, direct"
     if not math.isfinite(sojourn):
-        return _Condition("sojourn long enough", False, sojourn, "steps, direct", "infeasible")
-    if study.flown is not None:
-        mode, steps = study.flown
-        return _Condition(
-            "sojourn long enough",
-            steps >= sojourn,
-            sojourn,
-            "steps, direct",
-            f"the flight's shortest stay, in {mode}, lasts {steps} steps",
-        )
+        return _Condition(asks, False, sojourn, what, "infeasible", "no sojourn is")
+    if len(study.names) == 1:
+        return _Condition(asks, True, sojourn, what, "nothing switches", "nothing switches")
+    asked = f"{sojourn:.0f} {plural('step', sojourn)}"
     short = study.too_short_probability
     worst = int(np.argmax(short))
-    return _Condition(
-        "sojourn long enough",
-        bool(short[worst] == 0.0),
-        sojourn,
-        "steps, direct",
+    by_chain = (
         f"by the transition matrix {short[worst]:.3g} of the stays in {study.names[worst]} are "
-        "shorter",
+        "shorter"
+    )
+    if study.flown is None:
+        return _Condition(
+            asks,
+            bool(short[worst] == 0.0),
+            sojourn,
+            what,
+            f"judged by the modes' chain: {by_chain}",
+            f"{asked}; {100 * short[worst]:.3g} % of the chain's are less"
+            if short[worst] > 0.0
+            else f"{asked}; none of the chain's is less",
+        )
+    mode, steps = study.flown
+    return _Condition(
+        asks,
+        steps >= sojourn,
+        sojourn,
+        what,
+        f"judged by the flight, whose shortest stay, in {mode}, lasts {steps} steps; {by_chain}",
+        f"{asked}; the flight's last {steps} or more",
     )
 
 
@@ -290,10 +316,10 @@ def modes_table(study: Study) -> Table:
         columns,
         {
             "mode": list(study.names),
-            "alpha": _cells(columns["alpha"]),
+            "alpha": _cells(columns["alpha"], "never", 1.0),
             "k": _cells(columns["condition_number"]),
             "decay\nsteps": _cells(columns["decay_steps_direct"]),
-            "growth": _cells(columns["growth"]),
+            "growth": _cells(columns["growth"], "never", 1.0),
             "mean stay\nsteps": _cells(columns["mean_sojourn_steps"]),
             "too\nshort": _cells(columns["too_short_probability"]),
         },
@@ -324,14 +350,14 @@ def simulation_table(study: Study) -> Table:
     )
 
 
-def _cell(value: float | None, never: str = "never") -> str:
+def _cell(value: float | None, never: str = "never", *others: float) -> str:
     if value is None:
         return "-"
-    return f"{value:.4g}" if math.isfinite(value) else never if value > 0 else "none"
+    return number(value, *others) if math.isfinite(value) else never if value > 0 else "none"
 
 
-def _cells(values: Sequence[float | None], never: str = "never") -> list[str]:
-    return [_cell(value, never) for value in values]
+def _cells(values: Sequence[float | None], never: str = "never", *others: float) -> list[str]:
+    return [_cell(value, never, *others) for value in values]
 
 
 def _percent(values: Sequence[float]) -> list[str]:

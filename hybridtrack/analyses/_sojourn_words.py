@@ -5,7 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hybridtrack.analyses._sojourn_bounds import state_effects
+from hybridtrack.analyses._sojourn_numbers import as_set, number
 from hybridtrack.analyses._sojourn_study import Study
+
+GROWS = 1.0 + 1e-9  # a growth up to this is none but for rounding
+SAME = 1e-9  # relative: two norms that differ by less differ by rounding
 
 
 def conclusions(study: Study) -> list[str]:
@@ -21,25 +26,27 @@ def conclusions(study: Study) -> list[str]:
 def _headline(study: Study) -> str:
     sojourn, step_s = study.direct_sojourn, study.step_s
     if not math.isfinite(sojourn):
-        smallest, at_decay = study.direct.delay_error, study.direct.error_bound_at_decay
+        smallest = study.direct.delay_error or 0.0
+        at_decay = study.direct.error_bound_at_decay or 0.0
         delay = f"{study.delay_steps} {plural('step', study.delay_steps)}"
         return (
             f"No sojourn is long enough: a decision delay of {delay} adds up to "
-            f"{smallest:.4g} to the error at every switch, and error_bound is "
-            f"{study.error_bound:.4g}; it has to be above {smallest:.4g}, and {at_decay:.4g} "
+            f"{number(smallest, study.error_bound)} to the error at every switch, and error_bound "
+            f"is {as_set(study.error_bound)}; it has to be above "
+            f"{number(smallest, study.error_bound)}, and {number(at_decay, smallest)} "
             "costs no longer sojourn than the decay does."
         )
-    kept = f", down to the error bound of {study.error_bound:.4g}" if study.error_bound else ""
+    kept = f", down to the error bound of {number(study.error_bound)}" if study.error_bound else ""
     if len(study.names) == 1:
         return (
             f"There is one mode, so nothing switches; its filter's mean error is below "
-            f"{study.rate:g}^t from {sojourn:.0f} {plural('step', sojourn)} "
-            f"({sojourn * step_s:.4g} s) on."
+            f"{as_set(study.rate)}^t from {sojourn:.0f} {plural('step', sojourn)} "
+            f"({number(sojourn * step_s)} s) on."
         )
     return (
         f"Every mode must last at least {sojourn:.0f} {plural('step', sojourn)} "
-        f"({sojourn * step_s:.4g} s) for the mean error to shrink by the factor "
-        f"{study.rate:g} per step from switch to switch{kept}; the paper's bound "
+        f"({number(sojourn * step_s)} s) for the mean error to shrink by the factor "
+        f"{as_set(study.rate)} per step from switch to switch{kept}; the paper's bound "
         f"{_asks(study.rate_correct_sojourn, step_s)} once corrected, and "
         f"{_asks(study.printed_sojourn, step_s)} as printed."
     )
@@ -48,7 +55,7 @@ def _headline(study: Study) -> str:
 def _asks(steps: float, step_s: float) -> str:
     if not math.isfinite(steps):
         return "can't be met"
-    return f"asks for {steps:.0f} ({steps * step_s:.4g} s)"
+    return f"asks for {steps:.0f} ({number(steps * step_s)} s)"
 
 
 def plural(word: str, number: float) -> str:
@@ -80,13 +87,13 @@ def _in_the_scenario(study: Study) -> list[str]:
 def _between(study: Study) -> list[str]:
     worst = int(np.argmax(study.direct.growth))
     growth = study.direct.growth[worst]
-    if growth <= 1.0 + 1e-9:
+    if growth <= GROWS:
         return []
     if len(study.names) == 1:
-        return [f"Before that it may grow to {growth:.4g} times that."]
+        return [f"Before that it may grow to {number(growth, 1.0)} times that."]
     return [
-        f"Between switches the mean error may grow to {growth:.4g} times what it shall be, in "
-        f"'{study.names[worst]}', before it shrinks: leave room for that."
+        f"Between switches the mean error may grow to {number(growth, 1.0)} times what it shall "
+        f"be, in '{study.names[worst]}', before it shrinks: leave room for that."
     ]
 
 
@@ -120,15 +127,22 @@ def notes(study: Study) -> list[str]:
         "mu^t: ln k / ln(mu/alpha), not ln k / |ln alpha|",
         "the first term of eq. 41 as printed is negative for every M0 above b, so it never asks "
         "for anything; it is |ln(1 - b/M0)| / |ln mu| that keeps M0",
-        "the paper has the error below mu^t between switches too; it is so when a switch is "
-        f"noticed, and {max(study.direct.growth):.4g} times that at most between",
     ]
-    bound = study.disturbance
-    if bound.printed is not None and bound.infinity is not None and bound.printed > 0:
+    growth = max(study.direct.growth)
+    if growth > GROWS:
         found.append(
-            f"U as printed takes the 1-norm, which bounds no entry of u: {bound.printed:.4g} "
-            f"instead of {bound.infinity:.4g} by the infinity norm"
+            "the paper has the error below mu^t between switches too; it is so when a switch is "
+            f"noticed, and {number(growth, 1.0)} times that at most between"
         )
+    if study.disturbance.printed is not None:
+        largest_state = float(study.state.each[study.mismatch.counts].max(initial=0.0))
+        columns, rows = state_effects(study.mismatch, largest_state)
+        if not math.isclose(columns, rows, rel_tol=SAME):
+            found.append(
+                "U as printed takes the 1-norm, which is no bound in general; of what the states "
+                f"add it is {number(columns, rows)}, and by the infinity norm "
+                f"{number(rows, columns)}"
+            )
     if np.any(study.mismatch.input_effect):
         found.append(
             "the modes' inputs differ; the paper's U leaves inputs out, the corrected ones don't"
@@ -144,20 +158,19 @@ def notes(study: Study) -> list[str]:
                 f"the filter of '{name}' has a Jordan block of size {one.largest_block}: eq. 30 "
                 "stands for eq. 29, and k depends on how its chains are scaled"
             )
-    if len(study.names) == 1:
-        found.append("there is one mode, and nothing to switch to: nothing is simulated")
-    elif not math.isfinite(study.direct.steps):
-        found.append("nothing is simulated, since no sojourn is long enough")
-    elif not study.simulated:
+    if study.simulated:
+        more = round(study.direct.steps) - 1
         found.append(
-            "nothing is simulated, since a run would end before its first switch; raise "
-            "'simulated_steps' or lower 'simulated_runs'"
+            f"simulated sojourns last from their smallest to {more} {plural('step', more)} more, "
+            "all equally likely"
+            if more
+            else "simulated sojourns last as long as their smallest"
         )
-    else:
-        found.append(
-            "simulated sojourns last from their smallest to "
-            f"{round(study.direct.steps) - 1} steps more, all equally likely"
-        )
+        if study.error_bound and study.delay_steps:
+            found.append(
+                "every second simulated run starts without an error, which holds M0 against what "
+                f"the delay leaves, the others at 10 M0 ({number(10 * study.error_bound)})"
+            )
     return [*found, *study.notes]
 
 

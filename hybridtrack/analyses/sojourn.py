@@ -6,6 +6,7 @@ switches by which that is paid back (section 3, Theorem 3); their bound is here 
 its proof has it, beside what the powers of the filters' own matrices say.
 """
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from hybridtrack.analyses._sojourn_bounds import (
     rate_correct_bound,
 )
 from hybridtrack.analyses._sojourn_charts import charts
+from hybridtrack.analyses._sojourn_numbers import as_set, number
 from hybridtrack.analyses._sojourn_observability import joint_observability
 from hybridtrack.analyses._sojourn_study import Study
 from hybridtrack.analyses._sojourn_tables import (
@@ -34,7 +36,7 @@ from hybridtrack.analyses._sojourn_tables import (
     modes_table,
     simulation_table,
 )
-from hybridtrack.analyses._sojourn_words import conclusions, notes, plural
+from hybridtrack.analyses._sojourn_words import conclusions, listed, notes, plural
 from hybridtrack.analyses._switching_runs import (
     MOST_CELLS,
     Claimed,
@@ -141,8 +143,8 @@ def sojourn_study(experiment: Experiment, settings: Settings) -> Study:
             raise Unsuited(
                 f"a decision delay of {delay} {plural('step', delay)} leaves an error for "
                 "ever, and how large it may be isn't said; add 'error_bound' under "
-                f"analyses.sojourn, above {smallest.delay_error:.4g} "
-                f"({smallest.error_bound_at_decay:.4g} costs no longer sojourn)",
+                f"analyses.sojourn, above {number(smallest.delay_error)} "
+                f"({number(smallest.error_bound_at_decay or 0.0)} costs no longer sojourn)",
                 "analyses",
                 "sojourn",
                 "error_bound",
@@ -152,6 +154,9 @@ def sojourn_study(experiment: Experiment, settings: Settings) -> Study:
     printed_errors = delay_errors(structures, disturbance.printed, n, delay)
     corrected_errors = delay_errors(structures, disturbance.infinity, n, delay)
     second_moment, of_start = _second_moment(experiment, model)
+    simulated, not_simulated = _simulate(
+        experiment, settings, transitions, wrong, state, direct, error_bound
+    )
     return Study(
         model=model,
         rate=rate,
@@ -166,9 +171,9 @@ def sojourn_study(experiment: Experiment, settings: Settings) -> Study:
         printed=printed_bound(structures, printed_errors, rate, error_bound),
         rate_correct=rate_correct_bound(structures, corrected_errors, rate, error_bound),
         direct=direct,
-        simulated=_simulate(experiment, settings, transitions, wrong, state, direct, error_bound),
+        simulated=simulated,
         flown=_flown(experiment),
-        notes=(*said, *of_start, *of_state),
+        notes=(*not_simulated, *said, *of_start, *of_state),
     )
 
 
@@ -176,8 +181,8 @@ def _check(settings: Settings) -> None:
     rate, delay = settings.convergence_rate, settings.decision_delay_steps
     if not 0.0 < rate < 1.0:
         raise Unsuited(
-            f"'convergence_rate' is {rate:g}; the factor by which an error shrinks per step lies "
-            "above 0 and below 1",
+            f"'convergence_rate' is {as_set(rate)}; the factor by which an error shrinks per step "
+            "lies above 0 and below 1",
             "analyses",
             "sojourn",
             "convergence_rate",
@@ -217,8 +222,8 @@ def _check_rate(
     alpha = structures[slowest].rate
     if rate <= alpha:
         raise Unsuited(
-            f"mode '{names[slowest]}' decays at {alpha:.4g} per step: choose 'convergence_rate' "
-            f"above it, and below 1 (it is {rate:g})",
+            f"mode '{names[slowest]}' decays at {number(alpha, 1.0, rate)} per step: choose "
+            f"'convergence_rate' above it, and below 1 (it is {as_set(rate)})",
             "analyses",
             "sojourn",
             "convergence_rate",
@@ -231,7 +236,10 @@ def _check_rate(
 def _state_bound(
     experiment: Experiment, settings: Settings, model: JumpMarkovModel, wrong: Mismatch
 ) -> tuple[StateBound, tuple[str, ...]]:
-    """As set, else what the scenario's flights have; inf where neither says anything."""
+    """As set, else what the scenario's flights have; inf where neither says anything.
+
+    A flight that is known here and there alone has what is known of it.
+    """
     names, counts = model.state_names, wrong.counts
     if settings.state_bound is not None or settings.state_norm_bound is not None:
         listed = [math.inf] if settings.state_bound is None else settings.state_bound
@@ -254,23 +262,27 @@ def _state_bound(
             )
         norm = math.inf if settings.state_norm_bound is None else settings.state_norm_bound
         return StateBound(np.minimum(np.broadcast_to(given, len(names)), norm), norm), ()
-    each, norm = np.zeros(len(names)), 0.0
+    each, norm, gaps = np.zeros(len(names)), 0.0, False
     for case in experiment.cases:
         if isinstance(case.truth, ChainTruth):
             return StateBound(np.full(len(names), math.inf), math.inf), ()
         flown = _in_order(case.truth.state, case.truth.state_names, names, math.inf)
-        flown = np.where(np.isnan(flown), 0.0, np.abs(flown))
-        each = np.maximum(each, flown.max(axis=0))
-        norm = max(norm, float(np.linalg.norm(flown[:, counts], axis=1).max()))
+        unknown = np.isnan(flown)
+        gaps = gaps or bool(unknown[:, counts].any())
+        largest = np.where(unknown, -math.inf, np.abs(flown)).max(axis=0)
+        each = np.maximum(each, np.where(unknown.all(axis=0), math.inf, largest))
+        told = flown[:, counts][~unknown[:, counts].any(axis=1)]
+        norm = max(norm, float(np.linalg.norm(told, axis=1).max()) if len(told) else math.inf)
     if not counts.any():
         return StateBound(each, norm), ()
-    largest = ", ".join(
-        f"{name} {bound:.4g}"
+    had = ", ".join(
+        f"{name} {number(bound)}"
         for name, bound, count in zip(names, each, counts, strict=True)
         if count and math.isfinite(bound)
     )
-    said = f"the states' bounds are what the flight itself has ({largest}, SI units)"
-    return StateBound(each, norm), (said,) if largest else ()
+    known = ", where it is known" if gaps else ""
+    said = f"the states' bounds are what the flight itself has{known} ({had}, SI units)"
+    return StateBound(each, norm), (said,) if had else ()
 
 
 def _in_order(
@@ -285,7 +297,10 @@ def _in_order(
 
 
 def _second_moment(experiment: Experiment, model: JumpMarkovModel) -> tuple[Array, tuple[str, ...]]:
-    """E[x_0 x_0'] (n_x, n_x), the paper's Pi_0: of the filters' start, or where the truth's is."""
+    """E[x_0 x_0'] (n_x, n_x), the paper's Pi_0: of the filters' start, or where the truth's is.
+
+    What the truth doesn't say is taken as 0, and said.
+    """
     initial, names = experiment.initial, model.state_names
     if not (initial.follows_truth or initial.two_point):
         return np.outer(initial.mean, initial.mean) + initial.covariance, ()
@@ -294,10 +309,17 @@ def _second_moment(experiment: Experiment, model: JumpMarkovModel) -> tuple[Arra
         start, there = truth.initial_mean, truth.bank.state_names
     else:
         start, there = truth.state[0], truth.state_names
-    mean = np.nan_to_num(_in_order(start[np.newaxis], there, names, 0.0)[0])
-    said = "for condition 1 the mean of the start is that of the truth"
+    mean = _in_order(start[np.newaxis], there, names, math.nan)[0]
+    unknown = [name for name, value in zip(names, mean, strict=True) if math.isnan(value)]
+    told = "that of the truth"
     if len(experiment.cases) > 1:
-        said += f" in '{experiment.cases[0].name}'"
+        told += f" in '{experiment.cases[0].name}'"
+    if len(unknown) == len(names):
+        told = "taken as 0, since the truth isn't known"
+    elif unknown:
+        told += f", and 0 in {listed(unknown)}, of which it says nothing"
+    mean = np.where(np.isnan(mean), 0.0, mean)
+    said = f"for condition 1 the mean of the start is {told}"
     return np.outer(mean, mean) + initial.covariance, (said,)
 
 
@@ -309,7 +331,7 @@ def _flown(experiment: Experiment) -> tuple[str, int] | None:
             continue
         mode = case.truth.mode[1:]
         ends = np.flatnonzero(mode[1:] != mode[:-1]) + 1
-        for begin, end in zip((0, *ends[:-1]), ends, strict=True):
+        for begin, end in itertools.pairwise((0, *ends)):
             if mode[begin] >= 0 and (shortest is None or end - begin < shortest[1]):
                 shortest = experiment.truth_modes[mode[begin]], int(end - begin)
     return shortest
@@ -326,20 +348,23 @@ def _simulate(
     state: StateBound,
     direct: DirectBound,
     error_bound: float,
-) -> tuple[tuple[int, SwitchingRuns], ...]:
-    """Random switching by its smallest sojourn: up to the direct bound, where there is one."""
+) -> tuple[tuple[tuple[int, SwitchingRuns], ...], tuple[str, ...]]:
+    """Random switching by its smallest sojourn, up to the direct bound; or else why not."""
     delay, rate = settings.decision_delay_steps, settings.convergence_rate
-    if len(transitions) < 2 or not math.isfinite(direct.steps):
-        return ()
+    if len(transitions) < 2:
+        return (), ("there is one mode, and nothing to switch to: nothing is simulated",)
+    if not math.isfinite(direct.steps):
+        return (), ("nothing is simulated, since no sojourn is long enough",)
     longest = round(direct.steps)
-    steps = settings.simulated_steps
-    if steps is None:
-        steps = min(SOJOURNS_LONG * (longest + delay), LONGEST_RUN_STEPS)
-        steps = min(steps, MOST_CELLS // settings.simulated_runs)
-    steps = min(steps, int(math.log(FADED) / math.log(rate)))
+    steps, why = _run_length(settings, longest + delay)
     if steps <= longest + delay:  # no run would come to a switch
-        return ()
-    claimed = Claimed(rate, error_bound, max(direct.growth), direct.delay_error or 0.0)
+        asked = f"{longest + delay} {plural('step', longest + delay)}"
+        return (), (f"nothing is simulated, since a sojourn of {asked} {why}",)
+    claimed = Claimed(rate, error_bound, max(direct.growth))
+    # Every second run starts without an error where a delay leaves one: M0 alone is its bound then.
+    start = np.full(settings.simulated_runs, 10.0 * error_bound or 1.0)
+    if error_bound and delay:
+        start[1::2] = 0.0
     found = []
     for sojourn in whole_numbers(longest, MOST_SOJOURNS_TRIED):
         seed = np.random.SeedSequence(experiment.seed, spawn_key=(STREAM, sojourn))
@@ -356,12 +381,37 @@ def _simulate(
                     delay_steps=delay,
                     runs=settings.simulated_runs,
                     steps=steps,
-                    start=10.0 * error_bound or 1.0,
+                    start=start,
                     generator=np.random.default_rng(seed),
                 ),
             )
         )
-    return tuple(found)
+    return tuple(found), ()
+
+
+def _run_length(settings: Settings, sojourn: int) -> tuple[int, str]:
+    """The steps of a simulated run, and what keeps it from having more."""
+    runs, rate = settings.simulated_runs, settings.convergence_rate
+    faded = int(math.log(FADED) / math.log(rate))
+    limits = [(faded, f"outlasts the {faded} after which {as_set(rate)}^t is below {FADED:g}")]
+    if settings.simulated_steps is not None:
+        set_steps = settings.simulated_steps
+        limits.append((set_steps, f"fills a run of {set_steps}: raise 'simulated_steps'"))
+    else:
+        by_memory = MOST_CELLS // runs
+        limits += [
+            (SOJOURNS_LONG * sojourn, ""),
+            (
+                LONGEST_RUN_STEPS,
+                f"fills a run of {LONGEST_RUN_STEPS}, as long as one gets by itself: set "
+                "'simulated_steps' to more",
+            ),
+            (
+                by_memory,
+                f"fills a run of {by_memory}, as long as {runs} can be: lower 'simulated_runs'",
+            ),
+        ]
+    return min(limits)
 
 
 ANALYSIS = Analysis(
