@@ -19,7 +19,8 @@ from hybridtrack.analyses._errors_of_tests import (
     lower_error,
     upper_error,
 )
-from hybridtrack.analyses._horizons import horizon
+from hybridtrack.analyses._horizons import _seems_to_level_off, horizon
+from hybridtrack.analyses._least_errors import without_noise
 from hybridtrack.analyses._observability_matrices import (
     ModeDynamics,
     initial_mode_test,
@@ -107,9 +108,112 @@ def test_with_equal_variances_the_error_levels_off_though_lemma_2_is_met():
     assert cell(found, "single", "double", "initial_state_free_scan") == math.inf
     # The published digits of the plateau, .3387 +- .001.
     assert cell(found, "single", "double", "horizon_last_error") == pytest.approx(0.3387, abs=1e-3)
-    assert "levels off at 0.339" in cell(found, "single", "double", "horizon_because")
-    assert "can never be told apart" in found.conclusions[0]
+    assert found.conclusions[0] == (
+        "single and double can never be told apart at 1 % error: even without noise the best test "
+        "would err in 33.8 % of cases."
+    )
     assert any("lemma 2 calls single and double distinguishable" in n for n in found.notes)
+
+
+def growing(gains, noise=1.0, growth=1.03, starts=(1.0, 1e-10), **changes):
+    """A constant, beside a state that grows with every scan."""
+    return scalar(1, noise, name=f"gains {gains}")._replace(
+        state_transition=np.diag([1.0, growth]),
+        input_effect=np.zeros(2),
+        process_noise_covariance=np.zeros((2, 2)),
+        measurement_matrix=np.array([gains]),
+        initial_mean=np.zeros(2),
+        initial_covariance=np.diag(starts),
+        **changes,
+    )
+
+
+def test_a_difference_that_grows_late_is_not_never():
+    """It is small for hundreds of scans, in which the error seems to level off."""
+    one, other = growing([1.0, 0.0]), growing([2.0, 1.0])
+    early, late = (horizon(one, other, 0.01, n, at_first_scan=True) for n in (256, 1000))
+    assert (early.lower, early.exact, early.upper) == (None, None, None)
+    assert early.because == "not within 256 scans, where the error seems to level off at 0.339"
+    assert late.exact is not None
+    assert 256 < late.exact < 1000
+    # So do two noises that differ by 0.5 %, without a state that grows.
+    one, other = scalar(1, 1), scalar(2, 1.005)
+    early = horizon(one, other, 0.01, 256, at_first_scan=True)
+    assert (early.lower, early.exact, early.upper) == (None, None, None)
+    # A difference below rounding may grow out of it.
+    one, other = growing([1.0, 0.0], starts=(1.0, 1e-32)), growing([1.0, 1.0], starts=(1.0, 1e-32))
+    assert horizon(one, other, 0.01, 64, at_first_scan=True).exact is None
+
+
+def test_a_growth_that_both_modes_share_changes_nothing_about_never():
+    """Twice the gains on both states: two known states, N(0, 1) against N(0, 4), at the best."""
+    one, other = growing([1.0, 1.0]), growing([2.0, 2.0])
+    found = horizon(one, other, 0.01, 64, at_first_scan=True)
+    assert found.exact == math.inf
+    variances = Spectrum(np.array([4.0, 4.0]), np.zeros(2))
+    assert found.last_error > error_probability(variances) > 0.263
+    assert found.because == "even without noise the best test would err in 26.3 % of cases"
+    # One step before the first scan it is the same, and a target above that error may be met.
+    assert horizon(one, other, 0.01, 64).exact == math.inf
+    assert horizon(one, other, 0.3, 64, at_first_scan=True).exact is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.booleans(), st.booleans())
+def test_no_number_of_scans_errs_less_than_a_test_without_noise(seed, at_first_scan, is_told):
+    """Modes of one motion, whose states start and show differently by a factor of each state."""
+    rng = np.random.default_rng(seed)
+    one = random_pair(seed, n_x=2, n_y=1)[0]
+    calm = one._replace(process_noise_covariance=np.zeros((2, 2)), input_effect=np.zeros(2))
+    factor = np.exp(rng.normal())
+    other = calm._replace(
+        name="other",
+        measurement_matrix=calm.measurement_matrix * factor,
+        initial_mean=calm.initial_mean + 0.3 * rng.normal(size=2),
+    )
+    told = np.diag([0.1, 0.0]) if is_told else None
+    best = without_noise(calm, other, at_first_scan, told)
+    assert best is not None
+    outputs = outputs_of(calm, other, 30, at_first_scan=at_first_scan, told_covariance=told)
+    after = spectrum(outputs, outputs.scans)
+    for s in (0.2, 0.5, 0.8):
+        assert chernoff_distance(after, s) <= chernoff_distance(best, s) * (1 + 1e-6)
+
+
+def test_without_noise_is_known_only_where_noises_and_inputs_are_the_same():
+    one, other = scalar(1, 1), scalar(2, 1)
+    assert without_noise(one, other, True, None) is not None
+    noisy = np.array([[0.1]])
+    for changed in (
+        other._replace(measurement_noise_covariance=np.array([[1.001]])),
+        other._replace(process_noise_covariance=noisy),
+        other._replace(input_effect=np.array([0.001])),
+    ):
+        assert without_noise(one, changed, True, None) is None
+        assert horizon(one, changed, 0.01, 64, at_first_scan=True).exact != math.inf
+    # Process noise is seen through the gains, which differ.
+    shaken = [m._replace(process_noise_covariance=noisy) for m in (one, other)]
+    assert without_noise(*shaken, True, None) is None
+    # With one motion and one gain it is the same, and starts alone may differ.
+    later = shaken[0]._replace(initial_covariance=np.array([[4.0]]))
+    best = without_noise(shaken[0], later, True, None)
+    assert best is not None
+    np.testing.assert_allclose(best.variance, [4.0], rtol=1e-12)
+    # A start of one mode that the other's can't have tells them apart for sure.
+    fixed = other._replace(initial_covariance=np.zeros((1, 1)))
+    assert without_noise(one, fixed, True, None) is None
+
+
+@pytest.mark.parametrize(("ratio", "seems"), [(0.5, True), (0.9, False), (1.0, False)])
+def test_gains_that_hardly_fall_from_doubling_to_doubling_promise_no_plateau(ratio, seems):
+    """A distance that grows with the logarithm of the scans has 1, and meets every target."""
+    gains = np.cumsum(0.05 * ratio ** np.arange(9))
+
+    def axes(scans):
+        return Spectrum(np.ones(1), np.sqrt(8 * gains[[int(math.log2(scans))]]))
+
+    assert bhattacharyya_distance(axes(256)) == pytest.approx(gains[-1])
+    assert _seems_to_level_off(axes, 256, 0.01) == seems
 
 
 def test_the_plateau_is_that_of_two_known_states():
@@ -508,6 +612,8 @@ def test_lemma_3_as_printed_never_holds_where_modes_share_h_and_r():
 @given(SEEDS, st.integers(1, 4))
 def test_lemma_3_in_both_conventions(seed, scans):
     """By the powers of the paper's eq. 9, and with A_new A_old^(k1-k0-1) in ours."""
+    from scipy.linalg import eigh
+
     old, new = random_pair(seed)
     a, b = as_reference(old), as_reference(new)
     power = np.linalg.matrix_power
@@ -522,7 +628,8 @@ def test_lemma_3_in_both_conventions(seed, scans):
         return mode["H"] @ P @ mode["H"].T + mode["R"]
 
     def relative(x, y):
-        return np.abs(x - y).max() / max(np.abs(x).max(), np.abs(y).max())
+        ratios = eigh(x, y, eigvals_only=True)
+        return (np.abs(ratios - 1) / np.maximum(ratios, 1)).max()
 
     printed = relative(output(b, state(a, scans)), output(a, state(a, scans)))
     assert transition_test_as_printed(old, new, scans).difference == pytest.approx(printed)
@@ -555,6 +662,72 @@ def test_equal_noises_are_alike_for_ever_whatever_the_gains():
     # A random walk of variance q seen by gain 2 is one of 4 q seen by gain 1.
     assert initial_state_free_scan(scalar(1, 1, process=4.0), scalar(2, 1, process=1.0)) == math.inf
     assert initial_state_free_scan(scalar(1, 1, process=1.0), scalar(2, 1, process=1.0)) == 2
+
+
+def measured(noise, start):
+    """Two constants, each measured, with one noise and one start each (variances)."""
+    return scalar(1, 1)._replace(
+        state_transition=np.eye(2),
+        input_effect=np.zeros(2),
+        process_noise_covariance=np.zeros((2, 2)),
+        measurement_matrix=np.eye(2),
+        measurement_noise_covariance=np.diag(noise),
+        initial_mean=np.zeros(2),
+        initial_covariance=np.diag(start),
+    )
+
+
+def test_sizes_that_have_nothing_to_do_with_a_difference_hide_nothing():
+    one, other = (measured([1e6, r], [1e6, 1e-2]) for r in (1e-4, 4e-4))
+    for pair in ((one, other), (other, one)):
+        assert initial_mode_test(*pair, 1).differ
+        assert transition_test(*pair, 1).differ
+        assert transition_test_as_printed(*pair, 1).differ
+        assert initial_state_free_scan(*pair) == 2
+    assert initial_mode_test(one, other, 1).difference == pytest.approx(3e-4 / 1.04e-2)
+    unsure, quiet = scalar(1, 2, initial=1e10), scalar(1, 1, initial=1e10)
+    found = initial_mode_test(unsure, quiet, 1)
+    assert found.differ
+    assert found.difference == pytest.approx(1e-10, rel=1e-4)  # 1 of 1e10, held to 1e-6
+    assert not initial_mode_test(quiet, quiet, 5).differ
+
+
+@pytest.mark.parametrize("noise", [1.0, 0.01, 0.001])
+def test_little_process_noise_tells_turns_apart_as_soon_as_much(noise):
+    changes = [f"modes.{m}.acceleration_std_m_s2={noise}" for m in ("gentle", "hard")]
+    one, other = mode_dynamics(model_at_one_step(config.load("observability_turns", changes))[0])
+    assert initial_state_free_scan(one, other) == initial_state_free_scan(other, one) == 4
+
+
+def test_noises_that_differ_late_are_compared_for_long_enough():
+    """What is free of both starts has one variance, and another covariance with its successor."""
+    one = scalar(1, 1, process=(1.25 + 3.1625) / 1.81)._replace(state_transition=np.array([[0.5]]))
+    other = scalar(1, 2, process=1.0)._replace(state_transition=np.array([[0.9]]))
+    assert initial_state_free_scan(one, other) == 4  # 2 n_x + 1 show but the variance
+
+
+@settings(max_examples=15, deadline=None)
+@given(SEEDS)
+def test_lemmas_depend_neither_on_units_of_outputs_nor_on_the_order_of_modes(seed):
+    rng = np.random.default_rng(seed)
+    U = np.diag(10.0 ** rng.uniform(-4, 4, 2))
+    pair = random_pair(seed, n_x=2)
+    pair = (pair[0], pair[int(rng.integers(2))]._replace(measurement_noise_covariance=np.eye(2)))
+    scaled = [
+        m._replace(
+            measurement_matrix=U @ m.measurement_matrix,
+            measurement_noise_covariance=U @ m.measurement_noise_covariance @ U,
+        )
+        for m in pair
+    ]
+    for test in (initial_mode_test, transition_test, transition_test_as_printed):
+        expected = test(*pair, 2).difference
+        assert test(*scaled, 2).difference == pytest.approx(expected, rel=1e-6)
+    assert initial_mode_test(*pair[::-1], 2).difference == pytest.approx(
+        initial_mode_test(*pair, 2).difference
+    )
+    found = {initial_state_free_scan(*p) for p in (pair, pair[::-1], scaled, scaled[::-1])}
+    assert len(found) == 1
 
 
 # ---- the delay of a switch -------------------------------------------------------------------
