@@ -24,7 +24,8 @@ def without_noise(
     functions themselves do, however the states grow. Of O_one and O_other the common row space
     of [O_one O_other] is kept: by Cayley and Hamilton 2 n_x scans show it.
     None where noises or inputs differ, or where the functions alone tell the modes apart for sure,
-    or where states are of too many sizes for numbers. The last two arguments are those of `outputs_of`.
+    or where states are of too many sizes for numbers. The last two arguments are those of
+    `outputs_of`.
     """
     if not _same_noises_and_inputs(one, other):
         return None
@@ -49,7 +50,7 @@ def without_noise(
         known = np.hstack([np.eye(drawn.shape[1]), np.zeros((drawn.shape[1], start.shape[1]))])
         roots.append(np.vstack([known, part @ np.hstack([drawn, start])]))
         means.append(np.concatenate([np.zeros(drawn.shape[1]), part @ mode.initial_mean]))
-    return _on_common_axes(*roots, means[1] - means[0])
+    return _on_common_axes(roots[0], roots[1], means[1] - means[0])
 
 
 def _same_noises_and_inputs(one: ModeDynamics, other: ModeDynamics) -> bool:

@@ -253,9 +253,9 @@ def initial_state_free_scan(one: ModeDynamics, other: ModeDynamics) -> float:
     Outputs are projected onto the left null space of [O_one O_other], where neither mode's initial
     state has a part; what is left has a mean (of known inputs) and a covariance under either mode.
     Outputs are first brought to common units, so that theirs don't matter.
-    inf where both are equal to SAME_TOLERANCE for ever: vectors of that null space are shifts of polynomials of
-    degree 2 n_x or less, so that what is left is a moving average no longer than that, and
-    4 n_x + 1 scans show all of it.
+    inf where both are equal to SAME_TOLERANCE for ever: vectors of that null space are shifts of
+    polynomials of degree 2 n_x or less, so that what is left is a moving average no longer than
+    that, and 4 n_x + 1 scans show all of it.
     """
     n_x, n_y = len(one.initial_mean), len(one.measurement_matrix)
     most = 4 * n_x + 1

@@ -194,7 +194,11 @@ def _conclusions(known: Theory, settings: Settings, warned: Sequence[str]) -> It
         yield (
             f"A switch from {slow.old.name} to {slow.new.name} is noticed at {error} error after "
             f"{count_of_scans(exact)}, {exact * step_s:.4g} s, at the soonest"
-            + (" (the slowest that is noticed)" if missed else " (the slowest switch)")
+            + (
+                " (the slowest of those that are noticed)"
+                if missed
+                else " (no switch takes longer)"
+            )
             + (f"; not noticed: {_switches(missed)}." if missed else ".")
         )
     else:
@@ -240,8 +244,8 @@ def _notes(
     )
     yield (
         "a horizon is exact by numerical inversion, and in brackets the soonest and the latest by "
-        "the Bhattacharyya and Chernoff bounds; >256 means not within 256 scans, the number looked "
-        "at, and ... an end of the bracket beyond them; never means that there is a proof"
+        "the Bhattacharyya and Chernoff bounds; >N means not within the N scans looked at, and "
+        "... an end of the bracket beyond them; never: proven, or outputs alike to rounding"
     )
     yield (
         "a switch is looked for with the old mode's settled filter, whose mean is spread as "
@@ -299,7 +303,7 @@ def _notes(
 def _share_outputs(model: JumpMarkovModel) -> bool:
     """Whether all modes have the same H and R."""
     H, R = model.measurement_matrix, model.measurement_noise_covariance
-    return bool((H == H[0]).all() and (R == R[0]).all())
+    return bool((H[0] == H).all() and (R[0] == R).all())
 
 
 def _why_alike(pair: PairOfModes, scans: int) -> str:
