@@ -12,7 +12,7 @@ from hybridtrack.analyses import Chart, Panel
 from hybridtrack.page import COLOURS, DASHES, TRUTH_COLOUR, finish, panels, plain, style
 
 PANEL_IN = 1.7  # inches that a panel is high
-MARKS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
+MARKS = ("0.25", "0.5", "0.65", "#882255")  # none is one of the first lines'
 MARK_DASHES = ("-", (0, (1.5, 1.5)), (0, (4, 1, 1, 1)), (0, (6, 2)))
 
 

@@ -118,21 +118,27 @@ def _parts_of(record: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 
 def _as_shown(columns: Mapping[str, list[str]]) -> Table:
-    """Texts by heading; the first column is a name's, and long texts are folded."""
+    """Texts by heading; names stand in the first column, or the first two, and long texts fold."""
     table = _plain_table()
     for i, (heading, cells) in enumerate(columns.items()):
         long = max(map(len, cells), default=0) > LONG_TEXT
-        justify: Literal["left", "right"] = "left" if i == 0 or long else "right"
+        named = i < _columns_of_names(columns)
+        justify: Literal["left", "right"] = "left" if named or long else "right"
         table.add_column(
             Text(heading),
             justify=justify,
             overflow="fold",
-            no_wrap=i > 0 and not long,
+            no_wrap=not (named or long),
             max_width=LONG_TEXT if long else None,
         )
     for row in zip(*columns.values(), strict=True):
         table.add_row(*map(Text, row))
     return table
+
+
+def _columns_of_names(columns: Mapping[str, list[str]]) -> int:
+    """How many of the first columns hold names."""
+    return 2 if list(columns)[:2] == ["from", "to"] else 1
 
 
 def _hanging(note: str) -> Table:
@@ -194,8 +200,10 @@ def _width(table: Table, console: Console) -> int:
     needed = Measurement.get(console, options, table).maximum
     if not console.is_terminal:
         return needed
-    names = max(len(str(cell)) for cell in (table.columns[0].header, *table.columns[0].cells))
-    return max(min(needed, console.width), needed - max(names - SHORTEST_NAME, 0))
+    names = [column for column in table.columns if not column.no_wrap and column.max_width is None]
+    longest = [max(len(str(cell)) for cell in (c.header, *c.cells)) for c in names]
+    spare = sum(max(length - SHORTEST_NAME, 0) for length in longest)
+    return max(min(needed, console.width), needed - spare)
 
 
 def _plain_table() -> Table:

@@ -1,14 +1,16 @@
 """Telling modes apart: figures against dense references, and what the paper's tests are worth."""
 
+import io
 import math
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 import reference_observability as reference
-from hybridtrack import config
+from hybridtrack import charts, config, page, tables
 from hybridtrack.analyses import analyses, model_at_one_step
 from hybridtrack.analyses._errors_of_tests import (
     Spectrum,
@@ -19,7 +21,8 @@ from hybridtrack.analyses._errors_of_tests import (
     lower_error,
     upper_error,
 )
-from hybridtrack.analyses._horizons import horizon
+from hybridtrack.analyses._horizons import _seems_to_level_off, horizon
+from hybridtrack.analyses._least_errors import without_noise
 from hybridtrack.analyses._observability_matrices import (
     ModeDynamics,
     initial_mode_test,
@@ -107,9 +110,112 @@ def test_with_equal_variances_the_error_levels_off_though_lemma_2_is_met():
     assert cell(found, "single", "double", "initial_state_free_scan") == math.inf
     # The published digits of the plateau, .3387 +- .001.
     assert cell(found, "single", "double", "horizon_last_error") == pytest.approx(0.3387, abs=1e-3)
-    assert "levels off at 0.339" in cell(found, "single", "double", "horizon_because")
-    assert "can never be told apart" in found.conclusions[0]
+    assert found.conclusions[0] == (
+        "single and double can never be told apart at 1 % error: even without noise the best test "
+        "would err in 33.8 % of cases."
+    )
     assert any("lemma 2 calls single and double distinguishable" in n for n in found.notes)
+
+
+def growing(gains, noise=1.0, growth=1.03, starts=(1.0, 1e-10), **changes):
+    """A constant, beside a state that grows with every scan."""
+    return scalar(1, noise, name=f"gains {gains}")._replace(
+        state_transition=np.diag([1.0, growth]),
+        input_effect=np.zeros(2),
+        process_noise_covariance=np.zeros((2, 2)),
+        measurement_matrix=np.array([gains]),
+        initial_mean=np.zeros(2),
+        initial_covariance=np.diag(starts),
+        **changes,
+    )
+
+
+def test_a_difference_that_grows_late_is_not_never():
+    """It is small for hundreds of scans, in which the error seems to level off."""
+    one, other = growing([1.0, 0.0]), growing([2.0, 1.0])
+    early, late = (horizon(one, other, 0.01, n, at_first_scan=True) for n in (256, 1000))
+    assert (early.lower, early.exact, early.upper) == (None, None, None)
+    assert early.because == "not within 256 scans, where the error seems to level off at 0.339"
+    assert late.exact is not None
+    assert 256 < late.exact < 1000
+    # So do two noises that differ by 0.5 %, without a state that grows.
+    one, other = scalar(1, 1), scalar(2, 1.005)
+    early = horizon(one, other, 0.01, 256, at_first_scan=True)
+    assert (early.lower, early.exact, early.upper) == (None, None, None)
+    # A difference below rounding may grow out of it.
+    one, other = growing([1.0, 0.0], starts=(1.0, 1e-32)), growing([1.0, 1.0], starts=(1.0, 1e-32))
+    assert horizon(one, other, 0.01, 64, at_first_scan=True).exact is None
+
+
+def test_a_growth_that_both_modes_share_changes_nothing_about_never():
+    """Twice the gains on both states: two known states, N(0, 1) against N(0, 4), at the best."""
+    one, other = growing([1.0, 1.0]), growing([2.0, 2.0])
+    found = horizon(one, other, 0.01, 64, at_first_scan=True)
+    assert found.exact == math.inf
+    variances = Spectrum(np.array([4.0, 4.0]), np.zeros(2))
+    assert found.last_error > error_probability(variances) > 0.263
+    assert found.because == "even without noise the best test would err in 26.3 % of cases"
+    # One step before the first scan it is the same, and a target above that error may be met.
+    assert horizon(one, other, 0.01, 64).exact == math.inf
+    assert horizon(one, other, 0.3, 64, at_first_scan=True).exact is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.booleans(), st.booleans())
+def test_no_number_of_scans_errs_less_than_a_test_without_noise(seed, at_first_scan, is_told):
+    """Modes of one motion, whose states start and show differently by a factor of each state."""
+    rng = np.random.default_rng(seed)
+    one = random_pair(seed, n_x=2, n_y=1)[0]
+    calm = one._replace(process_noise_covariance=np.zeros((2, 2)), input_effect=np.zeros(2))
+    factor = np.exp(rng.normal())
+    other = calm._replace(
+        name="other",
+        measurement_matrix=calm.measurement_matrix * factor,
+        initial_mean=calm.initial_mean + 0.3 * rng.normal(size=2),
+    )
+    told = np.diag([0.1, 0.0]) if is_told else None
+    best = without_noise(calm, other, at_first_scan, told)
+    assert best is not None
+    outputs = outputs_of(calm, other, 30, at_first_scan=at_first_scan, told_covariance=told)
+    after = spectrum(outputs, outputs.scans)
+    for s in (0.2, 0.5, 0.8):
+        assert chernoff_distance(after, s) <= chernoff_distance(best, s) * (1 + 1e-6)
+
+
+def test_without_noise_is_known_only_where_noises_and_inputs_are_the_same():
+    one, other = scalar(1, 1), scalar(2, 1)
+    assert without_noise(one, other, True, None) is not None
+    noisy = np.array([[0.1]])
+    for changed in (
+        other._replace(measurement_noise_covariance=np.array([[1.001]])),
+        other._replace(process_noise_covariance=noisy),
+        other._replace(input_effect=np.array([0.001])),
+    ):
+        assert without_noise(one, changed, True, None) is None
+        assert horizon(one, changed, 0.01, 64, at_first_scan=True).exact != math.inf
+    # Process noise is seen through the gains, which differ.
+    shaken = [m._replace(process_noise_covariance=noisy) for m in (one, other)]
+    assert without_noise(*shaken, True, None) is None
+    # With one motion and one gain it is the same, and starts alone may differ.
+    later = shaken[0]._replace(initial_covariance=np.array([[4.0]]))
+    best = without_noise(shaken[0], later, True, None)
+    assert best is not None
+    np.testing.assert_allclose(best.variance, [4.0], rtol=1e-12)
+    # A start of one mode that the other's can't have tells them apart for sure.
+    fixed = other._replace(initial_covariance=np.zeros((1, 1)))
+    assert without_noise(one, fixed, True, None) is None
+
+
+@pytest.mark.parametrize(("ratio", "seems"), [(0.5, True), (0.9, False), (1.0, False)])
+def test_gains_that_hardly_fall_from_doubling_to_doubling_promise_no_plateau(ratio, seems):
+    """A distance that grows with the logarithm of the scans has 1, and meets every target."""
+    gains = np.cumsum(0.05 * ratio ** np.arange(9))
+
+    def axes(scans):
+        return Spectrum(np.ones(1), np.sqrt(8 * gains[[int(math.log2(scans))]]))
+
+    assert bhattacharyya_distance(axes(256)) == pytest.approx(gains[-1])
+    assert _seems_to_level_off(axes, 256, 0.01) == seems
 
 
 def test_the_plateau_is_that_of_two_known_states():
@@ -508,6 +614,8 @@ def test_lemma_3_as_printed_never_holds_where_modes_share_h_and_r():
 @given(SEEDS, st.integers(1, 4))
 def test_lemma_3_in_both_conventions(seed, scans):
     """By the powers of the paper's eq. 9, and with A_new A_old^(k1-k0-1) in ours."""
+    from scipy.linalg import eigh
+
     old, new = random_pair(seed)
     a, b = as_reference(old), as_reference(new)
     power = np.linalg.matrix_power
@@ -522,7 +630,8 @@ def test_lemma_3_in_both_conventions(seed, scans):
         return mode["H"] @ P @ mode["H"].T + mode["R"]
 
     def relative(x, y):
-        return np.abs(x - y).max() / max(np.abs(x).max(), np.abs(y).max())
+        ratios = eigh(x, y, eigvals_only=True)
+        return (np.abs(ratios - 1) / np.maximum(ratios, 1)).max()
 
     printed = relative(output(b, state(a, scans)), output(a, state(a, scans)))
     assert transition_test_as_printed(old, new, scans).difference == pytest.approx(printed)
@@ -555,6 +664,72 @@ def test_equal_noises_are_alike_for_ever_whatever_the_gains():
     # A random walk of variance q seen by gain 2 is one of 4 q seen by gain 1.
     assert initial_state_free_scan(scalar(1, 1, process=4.0), scalar(2, 1, process=1.0)) == math.inf
     assert initial_state_free_scan(scalar(1, 1, process=1.0), scalar(2, 1, process=1.0)) == 2
+
+
+def measured(noise, start):
+    """Two constants, each measured, with one noise and one start each (variances)."""
+    return scalar(1, 1)._replace(
+        state_transition=np.eye(2),
+        input_effect=np.zeros(2),
+        process_noise_covariance=np.zeros((2, 2)),
+        measurement_matrix=np.eye(2),
+        measurement_noise_covariance=np.diag(noise),
+        initial_mean=np.zeros(2),
+        initial_covariance=np.diag(start),
+    )
+
+
+def test_sizes_that_have_nothing_to_do_with_a_difference_hide_nothing():
+    one, other = (measured([1e6, r], [1e6, 1e-2]) for r in (1e-4, 4e-4))
+    for pair in ((one, other), (other, one)):
+        assert initial_mode_test(*pair, 1).differ
+        assert transition_test(*pair, 1).differ
+        assert transition_test_as_printed(*pair, 1).differ
+        assert initial_state_free_scan(*pair) == 2
+    assert initial_mode_test(one, other, 1).difference == pytest.approx(3e-4 / 1.04e-2)
+    unsure, quiet = scalar(1, 2, initial=1e10), scalar(1, 1, initial=1e10)
+    found = initial_mode_test(unsure, quiet, 1)
+    assert found.differ
+    assert found.difference == pytest.approx(1e-10, rel=1e-4)  # 1 of 1e10, held to 1e-6
+    assert not initial_mode_test(quiet, quiet, 5).differ
+
+
+@pytest.mark.parametrize("noise", [1.0, 0.01, 0.001])
+def test_little_process_noise_tells_turns_apart_as_soon_as_much(noise):
+    changes = [f"modes.{m}.acceleration_std_m_s2={noise}" for m in ("gentle", "hard")]
+    one, other = mode_dynamics(model_at_one_step(config.load("observability_turns", changes))[0])
+    assert initial_state_free_scan(one, other) == initial_state_free_scan(other, one) == 4
+
+
+def test_noises_that_differ_late_are_compared_for_long_enough():
+    """What is free of both starts has one variance, and another covariance with its successor."""
+    one = scalar(1, 1, process=(1.25 + 3.1625) / 1.81)._replace(state_transition=np.array([[0.5]]))
+    other = scalar(1, 2, process=1.0)._replace(state_transition=np.array([[0.9]]))
+    assert initial_state_free_scan(one, other) == 4  # 2 n_x + 1 show but the variance
+
+
+@settings(max_examples=15, deadline=None)
+@given(SEEDS)
+def test_lemmas_depend_neither_on_units_of_outputs_nor_on_the_order_of_modes(seed):
+    rng = np.random.default_rng(seed)
+    U = np.diag(10.0 ** rng.uniform(-4, 4, 2))
+    pair = random_pair(seed, n_x=2)
+    pair = (pair[0], pair[int(rng.integers(2))]._replace(measurement_noise_covariance=np.eye(2)))
+    scaled = [
+        m._replace(
+            measurement_matrix=U @ m.measurement_matrix,
+            measurement_noise_covariance=U @ m.measurement_noise_covariance @ U,
+        )
+        for m in pair
+    ]
+    for test in (initial_mode_test, transition_test, transition_test_as_printed):
+        expected = test(*pair, 2).difference
+        assert test(*scaled, 2).difference == pytest.approx(expected, rel=1e-6)
+    assert initial_mode_test(*pair[::-1], 2).difference == pytest.approx(
+        initial_mode_test(*pair, 2).difference
+    )
+    found = {initial_state_free_scan(*p) for p in (pair, pair[::-1], scaled, scaled[::-1])}
+    assert len(found) == 1
 
 
 # ---- the delay of a switch -------------------------------------------------------------------
@@ -841,3 +1016,174 @@ def test_the_chart_has_the_target_and_the_bracket():
         assert (band.low <= line.y * (1 + 1e-7)).all()
         assert (line.y <= band.high * (1 + 1e-7)).all()
         assert line.y[0] > 0.01 > line.y[-1]
+
+
+# ---- what is printed -------------------------------------------------------------------------
+
+
+def noted(findings, *words):
+    """The notes with all of some words."""
+    return [note for note in findings.notes if all(word in note for word in words)]
+
+
+def test_the_main_table_has_theorem_1_and_the_scans_looked_at():
+    found = analysed("observability_turns")
+    shown = found.table.shown
+    assert shown["theo-\nrem 1"] == ["yes", "yes"]
+    assert shown["lemma 2,\n3, ours"] == ["yes no yes"] * 2
+    assert shown["told apart:\nscans"] == ["23 (13-34)"] * 2
+    few = analysed("observability_turns", "analyses.observability.most_scans=20").table.shown
+    assert few["told apart:\nscans"] == [">20 (13-...)"] * 2
+    fewer = analysed("observability_turns", "analyses.observability.most_scans=7").table.shown
+    assert fewer["told apart:\nscans"] == fewer["switch:\nscans"] == [">7"] * 2
+    same = analysed("observability_turns", "modes.hard.turn_rate_deg_s=2").table.shown
+    assert same["told apart:\nscans"] == same["switch:\nscans"] == ["never"] * 2
+    assert same["any\nstart"] == ["alike"] * 2
+    assert same["theo-\nrem 1"] == ["no"] * 2
+
+
+def test_lemma_3_as_printed_is_said_to_fail_where_modes_share_h_and_r_and_only_there():
+    assert noted(analysed("observability_turns"), "all modes here share H and R", "violated")
+    same = analysed("observability_turns", "modes.hard.turn_rate_deg_s=2")  # ours fails, too
+    assert noted(same, "all modes here share H and R", "violated")
+    assert not noted(analysed("observability_scalar"), "all modes here share")
+    (note,) = noted(analysed("observability_turns"), "lemma 3 those of")
+    assert "of 2 scans" in note
+    assert "a transition 2 after the first" in note
+
+
+def test_notes_say_when_initial_is():
+    assert noted(analysed("observability_turns"), "`initial` is the state at the first scan")
+    setting = "analyses.observability.initial_at_first_scan"
+    assert noted(analysed("observability_turns", f"{setting}=false"), "one step before the first")
+    for at, said in ((True, 1), (False, 0)):
+        found = analysed("recorded_flight", f"{setting}={str(at).lower()}")
+        assert not noted(found, "`initial` is the state")
+        assert len(noted(found, "initial_at_first_scan isn't used")) == said
+
+
+def test_switches_that_are_not_noticed_are_named():
+    found = analysed("observability_turns")
+    assert found.conclusions[1].endswith("at the soonest (no switch takes longer).")
+    few = analysed("observability_turns", "analyses.observability.most_scans=7")
+    assert few.conclusions[1] == (
+        "No switch is noticed at 1 % error: gentle to hard, hard to gentle (within 7 scans)."
+    )
+    same = analysed("observability_turns", "modes.hard.turn_rate_deg_s=2")
+    assert same.conclusions[1] == (
+        "No switch is noticed at 1 % error: gentle to hard, hard to gentle (never)."
+    )
+    assert noted(found, "a test that knows when the switch took place")
+
+
+def test_a_switch_that_shows_at_once_is_a_switch():
+    found = analysed("observability_scalar", "modes.double.measurement_noise_covariance=[[1e20]]")
+    assert cell(found, "single", "double", "switch_delay_scans") == 1
+    assert cell(found, "double", "single", "switch_delay_scans") == 1
+    assert any("is noticed at 1 % error after 1 scan, 1 s" in text for text in found.conclusions)
+
+
+def test_modes_alike_by_lemma_2_are_said_to_be_so_for_a_true_reason():
+    """A mean, or more scans: outputs of one scan have the variances 1 + 1 and 4 / 4 + 1."""
+    quarter = ["modes.double.measurement_noise_covariance=[[1]]"]
+    moved = analysed(
+        "observability_turns",
+        "modes.hard.turn_rate_deg_s=2",
+    )
+    assert not noted(moved, "finds gentle and hard alike")
+    by_mean = analysed(
+        "observability_scalar",
+        *quarter,
+        "modes.double.measurement_matrix=[[-1]]",
+        "initial.mean=[9]",
+    )
+    assert cell(by_mean, "single", "double", "lemma_2") is False
+    assert noted(by_mean, "lemma 2 finds single and double alike", "by their means")
+    by_scans = analysed(
+        "observability_scalar",
+        *quarter,
+        "modes.double.measurement_matrix=[[1]]",
+        "modes.double.process_noise_covariance=[[1]]",
+    )
+    assert cell(by_scans, "single", "double", "lemma_2") is False
+    assert noted(by_scans, "lemma 2 finds single and double alike by the covariances of 1 scan;")
+
+
+def of_three(*changes):
+    """The scenario of two turns with a third that is hardly another than the first."""
+    third = "modes.third={motion: coordinated_turn, turn_rate_deg_s: 2.5, acceleration_std_m_s2: 1}"
+    return (third, "mean_sojourn_s={gentle: 60, hard: 40, third: 40}", *changes)
+
+
+def test_a_stretch_has_the_longest_of_its_modes_horizons():
+    found = analysed("observability_turns", *of_three("modes.third.turn_rate_deg_s=3.5"))
+    table = found.tables["stretches"].columns
+    own = {
+        old: [
+            cell(found, old, new, "horizon_scans")
+            for new in ("gentle", "hard", "third")
+            if new != old
+        ]
+        for old in ("gentle", "hard")
+    }
+    assert len(set(own["gentle"])) == 2
+    expected = [max(own[mode]) for mode in table["mode"]]
+    assert table["horizon_scans"] == expected
+
+
+def test_a_stretch_of_just_the_scans_needed_is_long_enough():
+    for until, warned in ((44, 1), (46, 0)):
+        legs = f"truth.legs=[{{until_s: {until}, mode: gentle}}, {{until_s: 200, mode: hard}}]"
+        warnings = warnings_about_legs(config.load("observability_turns", [legs]))
+        assert len(warnings) == warned  # 23 scans are needed
+
+
+def test_a_lint_without_proof_does_not_say_never():
+    still = analysed(
+        "observability_scalar",
+        "modes.double.measurement_noise_covariance=[[1]]",
+        "modes.double.input_effect=[0.0001]",
+        "analyses.observability.most_scans=64",
+    )
+    assert cell(still, "single", "double", "horizon_scans") is None
+    assert "seems to level off" in still.conclusions[0]
+    assert not any("can never" in text for text in still.conclusions)
+
+
+def test_a_curve_that_never_gets_there_ends_with_those_that_do():
+    found = analysed("observability_turns", *of_three("modes.third.turn_rate_deg_s=2"))
+    (panel,) = found.charts[0].panels
+    ends = {line.label: line.x[-1] for line in panel.lines}
+    assert max(ends.values()) == ends["gentle or hard"] == 41  # 1.2 times 34, rounded up
+    assert all(
+        len(line.x) == len(band.x) for line, band in zip(panel.lines, panel.bands, strict=True)
+    )
+
+
+def test_a_target_has_no_colour_of_the_first_curves():
+    assert not set(charts.MARKS) & set(page.COLOURS[:3])
+
+
+def test_long_names_of_modes_fold_on_a_narrow_terminal():
+    columns = {"from": ["constant_velocity"], "to": ["coordinated_turning"], "n": ["1" * 40]}
+    record = {
+        "title": "t",
+        "summary": "s",
+        "shown": [{"name": "", "columns": columns}],
+        "conclusions": [],
+        "notes": [],
+        "published": [],
+    }
+    out = io.StringIO()
+    tables.show_analysis(
+        record, Console(file=out, width=70, force_terminal=True, color_system=None)
+    )
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= 70
+    assert any("1" * 40 in line for line in lines)
+    assert not any("coordinated_turning" in line for line in lines)
+
+
+def test_the_first_claim_asks_for_more_than_rounding():
+    claim = config.load("observability_scalar").analysis_claims[0]
+    assert judge_interval(claim, Interval(1e-12, 1e-12, 1e-12), True) != claim.expect

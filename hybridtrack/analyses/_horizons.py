@@ -14,6 +14,7 @@ from hybridtrack.analyses._errors_of_tests import (
     lower_error,
     upper_error,
 )
+from hybridtrack.analyses._least_errors import without_noise
 from hybridtrack.analyses._observability_matrices import ModeDynamics
 from hybridtrack.analyses._telling_apart import Outputs, outputs_of, spectrum
 from hybridtrack.models import Array
@@ -59,10 +60,9 @@ def horizon(
     """How many scans tell two modes apart with an error of `target_error` or less.
 
     at_first_scan and told_covariance are those of `outputs_of`. More scans never harm, so that the
-    bounds bracket the exact error's scan and bisection finds it. An error that isn't below the
-    target after `most_scans` is called a plateau, and the horizon inf, if the distance D(1/2)
-    gained so little over the last doublings of the scans that by its geometric series it never
-    will be.
+    bounds bracket the exact error's scan and bisection finds it. The horizon is inf only where
+    there is a reason: the modes are the same, their outputs are alike to rounding, or even without
+    noise they would be confused more often than the target (`without_noise`).
     """
     if _same(one, other):
         ends = np.array([1.0, most_scans])
@@ -80,12 +80,64 @@ def horizon(
         if done or outputs.scans < scans or scans == most_scans:
             break
         scans = min(2 * scans, most_scans)
-    return _horizon(outputs, target_error, outputs.scans < scans, with_curve)
+    found = _horizon(outputs, target_error, outputs.scans < scans, with_curve)
+    if found.exact is None:
+        never = _why_never(one, other, outputs, target_error, at_first_scan, told_covariance)
+        if never:
+            found = found._replace(lower=math.inf, exact=math.inf, upper=math.inf, because=never)
+    return found
 
 
 def _same(one: ModeDynamics, other: ModeDynamics) -> bool:
     """Whether two modes differ in nothing but their names."""
     return all(map(np.array_equal, one[1:], other[1:]))
+
+
+def _why_never(
+    one: ModeDynamics,
+    other: ModeDynamics,
+    outputs: Outputs,
+    target: float,
+    at_first_scan: bool,
+    told: Array | None,
+) -> str:
+    """Why no number of scans meets the target; empty where that isn't known."""
+    alike = "their outputs are alike to rounding"
+    distance = bhattacharyya_distance(spectrum(outputs, outputs.scans))
+    if distance < ALIKE and outputs.scans >= _enough_scans(one) and not _grows(one, other):
+        return alike
+    best = without_noise(one, other, at_first_scan, told)
+    if best is None:
+        return ""
+    if bhattacharyya_distance(best) < ALIKE:
+        return alike
+    error = error_probability(best)
+    if error <= target * (1.0 + 1e-6):  # the integral's own error, and more
+        return ""
+    return f"even without noise the best test would err in {_rounded_down(100 * error)} % of cases"
+
+
+def _enough_scans(mode: ModeDynamics) -> int:
+    """Scans over which two modes' outputs are alike only if they are for ever.
+
+    A covariance of two outputs obeys a linear recursion of order 2 n_x in the scans between them,
+    and one of order n_x (n_x + 1) + 1 in the first one's: those of both modes' states, by Cayley
+    and Hamilton, and a constant.
+    """
+    n_x = len(mode.initial_mean)
+    return 2 * n_x + n_x * (n_x + 1) + 1
+
+
+def _grows(one: ModeDynamics, other: ModeDynamics) -> bool:
+    """Whether a difference lost in rounding may grow out of it exponentially."""
+    sizes = [np.abs(np.linalg.eigvals(m.state_transition)).max() for m in (one, other)]
+    return bool(max(sizes) > 1.0 + 1e-7)  # as near as a double eigenvalue of 1 is found
+
+
+def _rounded_down(number: float) -> str:
+    """To 3 digits."""
+    place = 10.0 ** (math.floor(math.log10(number)) - 2)
+    return f"{math.floor(number / place) * place:.3g}"
 
 
 def _horizon(outputs: Outputs, target: float, cut_short: bool, with_curve: bool) -> Horizon:
@@ -118,12 +170,8 @@ def _horizon(outputs: Outputs, target: float, cut_short: bool, with_curve: bool)
         because = f"not within {outputs.scans} scan" + ("" if outputs.scans == 1 else "s")
         if cut_short:
             because += ", beyond which the states are too large for numbers"
-        if not cut_short and bhattacharyya_distance(axes(outputs.scans)) < ALIKE:
-            lower = exact = upper = math.inf
-            because = "their outputs are alike to rounding"
-        elif lower is None and _levels_off(axes, outputs.scans, target):
-            lower = exact = upper = math.inf
-            because = f"the error levels off at {last:.3g}"
+        elif lower is None and _seems_to_level_off(axes, outputs.scans, target):
+            because += f", where the error seems to level off at {last:.3g}"
     curve = None
     if with_curve:
         found = upper is not None and upper < outputs.scans
@@ -132,8 +180,12 @@ def _horizon(outputs: Outputs, target: float, cut_short: bool, with_curve: bool)
     return Horizon(lower, exact, upper, because, end, last, curve)
 
 
-def _levels_off(axes: Callable[[int], Spectrum], scans: int, target: float) -> bool:
-    """Whether the lower bound stays above the target for ever, by D(1/2)'s last two doublings."""
+def _seems_to_level_off(axes: Callable[[int], Spectrum], scans: int, target: float) -> bool:
+    """Whether the last two doublings of the scans suggest that the target isn't met at all.
+
+    D(1/2) gained so little by them that, were its gains a geometric series, the lower bound of the
+    error would stay above the target. That is no proof: a small difference may grow later.
+    """
     if scans < 32:
         return False
     before, middle, last = (bhattacharyya_distance(axes(scans // n)) for n in (4, 2, 1))

@@ -15,7 +15,8 @@ from hybridtrack.models import Array, JumpMarkovModel
 from hybridtrack.roots import thin_square_root
 
 RANK_TOLERANCE = 1e-9  # of the largest singular value, columns being normalised
-SAME_TOLERANCE = 1e-9  # of the larger of two covariances: entries that differ by less are equal
+SAME_TOLERANCE = 1e-12  # relative: variances that differ by less, in any direction, are equal
+ROUNDING = 1e-13  # of the largest variance: what rounding leaves of differences
 CANCELLED = 1e-13  # of the sizes of a sum's terms
 
 
@@ -33,7 +34,11 @@ class ModeDynamics(NamedTuple):
 
 
 class OutputTests(NamedTuple):
-    """Whether covariances of outputs differ, and by how much at most, relative to the larger."""
+    """Whether covariances of outputs differ, and by how much at most.
+
+    difference: 1 - smaller / larger of the two variances of the combination of outputs where that
+    is largest. It doesn't depend on the outputs' units, nor on which covariance is named first.
+    """
 
     differ: bool
     difference: float
@@ -218,8 +223,24 @@ def _scan_covariance(mode: ModeDynamics, covariance: Array) -> Array:
 
 
 def _compared(one: Array, other: Array) -> OutputTests:
-    size = max(float(np.abs(one).max()), float(np.abs(other).max()))
-    difference = float(np.abs(one - other).max()) / size if size > 0.0 else 0.0
+    """Along the axes on which both covariances together are uncorrelated."""
+    variance = np.diag(one) + np.diag(other)
+    told = np.isfinite(variance) & (variance > 0.0)  # no more than numbers hold
+    scale = np.sqrt(variance[told])
+    unit = np.outer(scale, scale)
+    left, right = (covariance[np.ix_(told, told)] / unit for covariance in (one, other))
+    if not (scale.size and np.isfinite(left).all() and np.isfinite(right).all()):
+        return OutputTests(False, 0.0)
+    total, axes = np.linalg.eigh(left + right)
+    kept = total > ROUNDING * total[-1]
+    total, axes = total[kept], axes[:, kept]
+    apart = axes.T @ (left - right) @ axes
+    apart = np.where(np.abs(apart) > ROUNDING * total[-1], apart, 0.0) / np.sqrt(
+        np.outer(total, total)
+    )
+    # (l - 1) / (l + 1) of the generalised eigenvalues l.
+    share = min(float(np.abs(np.linalg.eigvalsh(apart)).max()), 1.0)
+    difference = 2.0 * share / (1.0 + share)
     return OutputTests(difference > SAME_TOLERANCE, difference)
 
 
@@ -231,28 +252,40 @@ def initial_state_free_scan(one: ModeDynamics, other: ModeDynamics) -> float:
 
     Outputs are projected onto the left null space of [O_one O_other], where neither mode's initial
     state has a part; what is left has a mean (of known inputs) and a covariance under either mode.
-    inf where both are equal for ever: vectors of that null space are shifts of polynomials of
-    degree 2 n_x or less, so that what is left is a moving average no longer than that, and
-    4 n_x + 1 scans show all of it.
+    Outputs are first brought to common units, so that theirs don't matter.
+    inf where both are equal to SAME_TOLERANCE for ever: vectors of that null space are shifts of
+    polynomials of degree 2 n_x or less, so that what is left is a moving average no longer than
+    that, and 4 n_x + 1 scans show all of it.
     """
     n_x, n_y = len(one.initial_mean), len(one.measurement_matrix)
     most = 4 * n_x + 1
+    unit = _units_of_outputs(one, other, most)
     starts = np.hstack(
         [observability_matrix(m.state_transition, m.measurement_matrix, most) for m in (one, other)]
     )
+    starts /= unit[:, np.newaxis]
     for scans in range(1, most + 1):
+        now = unit[: scans * n_y]
         null = _left_null_space(starts[: scans * n_y])
         if not null.shape[1]:
             continue
-        noises = [null.T @ noise_response(mode, scans) for mode in (one, other)]
+        noises = [null.T @ (noise_response(m, scans) / now[:, np.newaxis]) for m in (one, other)]
         left, right = (noise @ noise.T for noise in noises)
-        means = [null.T @ input_response(mode, scans) for mode in (one, other)]
+        inputs = [input_response(mode, scans) / now for mode in (one, other)]
         std = math.sqrt(max(float(np.abs(left).max()), float(np.abs(right).max())))
-        size = max(float(np.abs(mean).max()) for mean in means)
-        apart = float(np.abs(means[0] - means[1]).max()) > 1e-6 * max(std, size)
-        if apart or _compared(left, right).differ:
+        size = max(float(np.abs(mean).max()) for mean in inputs)
+        apart = float(np.abs(null.T @ (inputs[0] - inputs[1])).max())
+        if apart > SAME_TOLERANCE * max(std, size) or _compared(left, right).differ:
             return float(scans)
     return math.inf
+
+
+def _units_of_outputs(one: ModeDynamics, other: ModeDynamics, scans: int) -> Array:
+    """A size of each output, scan by scan (k n_y,): both modes' sensor noise, else their gains."""
+    noise = np.diag(one.measurement_noise_covariance + other.measurement_noise_covariance)
+    gains = np.abs(one.measurement_matrix) + np.abs(other.measurement_matrix)
+    unit = np.where(noise > 0.0, np.sqrt(noise), gains.max(axis=1))
+    return np.tile(np.where(unit > 0.0, unit, 1.0), scans)
 
 
 def input_response(mode: ModeDynamics, scans: int) -> Array:

@@ -3,6 +3,9 @@
 Hwang, Balakrishnan, Tomlin 2003, section 2, asks whether the covariances of the outputs differ.
 That is yes or no, and too easily yes: modes whose outputs differ a little may never be told apart.
 The headline here is the number of scans after which the best test errs no more often than a target.
+
+Without measurement noise (R = 0) the functions work, as in the paper's opening example; a scenario
+can't have it, since filters can't.
 """
 
 import math
@@ -15,6 +18,7 @@ from hybridtrack.analyses import Analysis, Measured
 from hybridtrack.analyses._findings import Band, Chart, Findings, Line, Mark, Panel, Table
 from hybridtrack.analyses._horizons import Horizon
 from hybridtrack.analyses._observability_matrices import (
+    RANK_TOLERANCE,
     SAME_TOLERANCE,
     ModeDynamics,
     initial_mode_test,
@@ -37,6 +41,7 @@ from hybridtrack.description import Experiment
 from hybridtrack.models import Array, JumpMarkovModel
 
 MOST_CURVES = 6  # that one picture holds
+MOST_SWITCHES = 3  # that a sentence names
 
 
 def _analyse(experiment: Experiment, settings: Settings, measured: Measured | None) -> Findings:
@@ -51,7 +56,11 @@ def _analyse(experiment: Experiment, settings: Settings, measured: Measured | No
     return Findings(
         table=table,
         conclusions=tuple(_conclusions(known, settings, warned)),
-        notes=(*known.notes, *warned[1:], *_notes(known, settings, table, scans)),
+        notes=(
+            *known.notes,
+            *warned[1:],
+            *_notes(known, settings, table, scans, experiment.initial.two_point),
+        ),
         tables={"modes": modes, "stretches": _stretches_table(experiment, known)},
         charts=(_chart(known, settings),),
     )
@@ -67,9 +76,10 @@ def _pairs_table(known: Theory, index: float, scans: int) -> Table:
             " ".join(_yes(row[name]) for name in ("lemma_2", "lemma_3_as_printed", "lemma_3"))
             for row in rows
         ],
-        "any start:\nscan": [_cell(value) for value in columns["initial_state_free_scan"]],
+        "theo-\nrem 1": [_yes(row["theorem_1"]) for row in rows],
+        "any\nstart": [_free(value) for value in columns["initial_state_free_scan"]],
         "told apart:\nscans": [_bracketed(pair.horizon) for pair in known.pairs],
-        "switch:\nscans": [_cell(pair.delay.exact) for pair in known.pairs],
+        "switch:\nscans": [_cell(pair.delay) for pair in known.pairs],
     }
     return Table(columns, shown)
 
@@ -119,7 +129,7 @@ def _modes_table(model: JumpMarkovModel) -> Table:
     }
     shown = {
         "mode": list(model.mode_names),
-        "index": [_cell(value) for value in indices],
+        "observability index": ["none" if math.isinf(k) else f"{k:.0f}" for k in indices],
         "not in the outputs": columns["unseen_states"],
     }
     return Table(columns, shown)
@@ -176,46 +186,84 @@ def _conclusions(known: Theory, settings: Settings, warned: Sequence[str]) -> It
             f"after {count_of_scans(exact)}, {exact * step_s:.4g} s{hardest}; no estimator does it "
             "sooner, even if the bank's models are true."
         )
-    switches = [p for p in known.pairs if 0.0 < sortable(p.delay.exact) < math.inf]
+    switches = [p for p in known.pairs if sortable(p.delay.exact) < math.inf]
+    missed = [p for p in known.pairs if p not in switches]
     if switches:
         slow = max(switches, key=lambda p: sortable(p.delay.exact))
         exact = sortable(slow.delay.exact)
         yield (
             f"A switch from {slow.old.name} to {slow.new.name} is noticed at {error} error after "
             f"{count_of_scans(exact)}, {exact * step_s:.4g} s, at the soonest"
-            + (" (the slowest that is noticed)." if len(known.pairs) > 1 else ".")
+            + (
+                " (the slowest of those that are noticed)"
+                if missed
+                else " (no switch takes longer)"
+            )
+            + (f"; not noticed: {_switches(missed)}." if missed else ".")
         )
+    else:
+        yield f"No switch is noticed at {error} error: {_switches(missed)}."
     if warned:
         more = f" (and {len(warned) - 1} more such, in the notes)" if len(warned) > 1 else ""
         yield f"Mind: {warned[0]}{more}."
+
+
+def _switches(missed: Sequence[PairOfModes]) -> str:
+    """Those that are never noticed, and those that aren't within the scans looked at."""
+    never = [pair for pair in missed if pair.delay.exact == math.inf]
+    late = [pair for pair in missed if pair.delay.exact is None]
+    said = []
+    for pairs, when in (
+        (never, "never"),
+        (late, f"within {count_of_scans(max((p.delay.looked_at for p in late), default=0))}"),
+    ):
+        if pairs:
+            named = ", ".join(f"{p.old.name} to {p.new.name}" for p in pairs[:MOST_SWITCHES])
+            more = f" and {len(pairs) - MOST_SWITCHES} more" if len(pairs) > MOST_SWITCHES else ""
+            said.append(f"{named}{more} ({when})")
+    return "; ".join(said)
 
 
 def _index(known: Theory, mode: ModeDynamics) -> int:
     return known.model.mode_names.index(mode.name)
 
 
-def _notes(known: Theory, settings: Settings, table: Table, scans: int) -> Iterator[str]:
+def _notes(
+    known: Theory, settings: Settings, table: Table, scans: int, two_point: bool
+) -> Iterator[str]:
     model = known.model
-    when = "at the first scan" if settings.initial_at_first_scan else "one step before the first"
+    # Filters that start from two scans say so in a note of their own.
+    if not two_point:
+        at = "at the first scan" if settings.initial_at_first_scan else "one step before the first"
+        yield f"`initial` is the state {at}, and its mean and covariance decide much"
+    elif settings.initial_at_first_scan:
+        yield "initial_at_first_scan isn't used, since filters start from two scans"
     yield (
-        f"`initial` is the state {when}, and its mean and covariance decide much; both modes are "
-        "equally probable beforehand, nothing is missed, and the noises are what the bank believes"
+        "both modes are equally probable beforehand, nothing is missed, and the noises are what "
+        "the bank believes"
     )
     yield (
-        "a horizon is (soonest - latest) by the Bhattacharyya and Chernoff bounds, and exact by "
-        "numerical inversion; inf means never, an empty cell that it lies beyond the scans looked "
-        "at"
+        "a horizon is exact by numerical inversion, and in brackets the soonest and the latest by "
+        "the Bhattacharyya and Chernoff bounds; >N means not within the N scans looked at, and "
+        "... an end of the bracket beyond them; never: proven, or outputs alike to rounding"
     )
     yield (
         "a switch is looked for with the old mode's settled filter, whose mean is spread as "
-        "`initial` is; the new mode drives the step to the first scan counted"
+        "`initial` is, by a test that knows when the switch took place, if it did; the new mode "
+        "drives the step to the first scan counted"
     )
-    printed, ours = table.columns["lemma_3_as_printed"], table.columns["lemma_3"]
-    if list(printed) != list(ours):
+    if _share_outputs(model):
+        yield (
+            "lemma 3 as printed lets the old mode drive the state to the scan of the transition: "
+            "all modes here share H and R, so that it is identically violated, and theorem 1 with "
+            "it; lemma 3 ours, and theorem 1 here, have the new mode drive that step, as "
+            "everywhere in this package"
+        )
+    else:
         yield (
             "lemma 3 as printed lets the old mode drive the state to the scan of the transition, "
-            "so that modes which share H and R never pass it; column lemma_3 has it with the new "
-            "mode driving that step, as everywhere in this package"
+            "so that modes which share H and R never pass it; lemma 3 ours, and theorem 1 here, "
+            "have the new mode drive that step, as everywhere in this package"
         )
     indices = observability_indices(model)
     if math.isinf(max(indices)):
@@ -226,16 +274,22 @@ def _notes(known: Theory, settings: Settings, table: Table, scans: int) -> Itera
             "lemma 2 fails and theorem 1 with it"
         )
     yield (
-        f"the lemmas compare the outputs of {count_of_scans(scans)}; ranks (columns normalised) "
-        f"and equality hold to {SAME_TOLERANCE:g} of the larger"
+        f"lemma 2 compares the outputs of {count_of_scans(scans)}, lemma 3 those of the scan of a "
+        f"transition {scans} after the first; all take `initial` at the first scan"
+    )
+    yield (
+        "any start: the scan from which noises and inputs alone tell the modes apart, whatever "
+        f"their states; alike: equal to {SAME_TOLERANCE:g} over all scans that could show a "
+        "difference"
+    )
+    yield (
+        f"ranks (columns normalised) hold to {RANK_TOLERANCE:g} of the largest singular value, "
+        f"equal covariances to {SAME_TOLERANCE:g} of the variance in any direction"
     )
     by_lemma = list(zip(known.pairs, table.columns["lemma_2"], strict=True))
     alike = [p for p, differ in by_lemma if not differ and sortable(p.horizon.exact) < math.inf]
     if alike:
-        yield (
-            f"lemma 2 as printed finds {alike[0].old.name} and {alike[0].new.name} alike, over so "
-            "few scans and without means; with more scans they are told apart"
-        )
+        yield _why_alike(alike[0], scans)
     apart = [p for p, differ in by_lemma if differ and p.horizon.exact == math.inf]
     if apart:
         yield (
@@ -246,16 +300,41 @@ def _notes(known: Theory, settings: Settings, table: Table, scans: int) -> Itera
         yield "the lemmas compare covariances only; horizons and delays use means and inputs too"
 
 
+def _share_outputs(model: JumpMarkovModel) -> bool:
+    """Whether all modes have the same H and R."""
+    H, R = model.measurement_matrix, model.measurement_noise_covariance
+    return bool((H[0] == H).all() and (R[0] == R).all())
+
+
+def _why_alike(pair: PairOfModes, scans: int) -> str:
+    """Why lemma 2 finds two modes alike that are told apart after some scans."""
+    says = f"lemma 2 finds {pair.old.name} and {pair.new.name} alike"
+    needed = int(sortable(pair.horizon.exact))
+    if needed > scans and initial_mode_test(pair.old, pair.new, needed).differ:
+        return (
+            f"{says} by the covariances of {count_of_scans(scans)}; those of {needed} scans differ"
+        )
+    return (
+        f"{says}, which compares covariances with `initial` at the first scan; they are told "
+        "apart by their means, or by the step that leads to the first scan"
+    )
+
+
 def _chart(known: Theory, settings: Settings) -> Chart:
     apart = [pair for pair in known.pairs if _index(known, pair.old) < _index(known, pair.new)]
     hardest = sorted(apart, key=lambda p: -sortable(p.horizon.exact))[:MOST_CURVES]
+    found = [pair.horizon for pair in hardest if sortable(pair.horizon.exact) < math.inf]
+    # Curves that never get there would squeeze the others.
+    ends = [f.curve.scans[-1] for f in found if f.curve is not None and f.curve.scans.size]
+    end = max(ends, default=math.inf)
     lines, bands = [], []
     for pair in hardest:
         label, curve = f"{pair.old.name} or {pair.new.name}", pair.horizon.curve
         if curve is None or not curve.scans.size:  # told apart by the first scan, with certainty
             continue
-        lines.append(Line(label, curve.scans, _positive(curve.exact)))
-        bands.append(Band(label, curve.scans, _positive(curve.lower), _positive(curve.upper)))
+        x, lower, exact, upper = (part[curve.scans <= end] for part in curve)
+        lines.append(Line(label, x, _positive(exact)))
+        bands.append(Band(label, x, _positive(lower), _positive(upper)))
     panel = Panel(
         "probability of error",
         lines=lines,
@@ -279,16 +358,22 @@ def _yes(passed: bool) -> str:
     return "yes" if passed else "no"
 
 
-def _cell(value: float | None) -> str:
-    if value is None:
-        return ">"
-    return "never" if math.isinf(value) else f"{value:.0f}"
+def _free(scan: float) -> str:
+    return "alike" if math.isinf(scan) else f"{scan:.0f}"
+
+
+def _cell(found: Horizon) -> str:
+    if found.exact is None:
+        return f">{found.looked_at}"
+    return "never" if math.isinf(found.exact) else f"{found.exact:.0f}"
 
 
 def _bracketed(found: Horizon) -> str:
-    if found.exact is None or math.isinf(found.exact):
-        return _cell(found.exact)
-    return f"{found.exact:.0f} ({_cell(found.lower)}-{_cell(found.upper)})"
+    """With what the bounds say; an end of the bracket that isn't known is '...'."""
+    if found.lower is None or math.isinf(found.lower):
+        return _cell(found)
+    upper = "..." if found.upper is None else f"{found.upper:.0f}"
+    return f"{_cell(found)} ({found.lower:.0f}-{upper})"
 
 
 ANALYSIS = Analysis(
