@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from hybridtrack.config import checks
 from hybridtrack.config.exact import WITH_PLACE, exact_figure
-from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
+from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import ClaimForm, ScenarioForm
 from hybridtrack.containment import NOISE, set_metrics
 from hybridtrack.description import ChosenEstimator

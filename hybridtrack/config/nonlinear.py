@@ -44,7 +44,8 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
         )
     if len(times_s) > MOST_STEPS + 1:
         raise document.error(
-            ("clock",), f"there are {len(times_s) - 1:,} steps and may be {MOST_STEPS:,}; shorten it"
+            ("clock",),
+            f"there are {len(times_s) - 1:,} steps and may be {MOST_STEPS:,}; shorten it",
         )
     model = _model(form, len(times_s) - 1, document)
     truth = _truth(form, model, document)
@@ -100,7 +101,9 @@ def _model(form: NonlinearForm, n_steps: int, document: Document) -> NonlinearMo
         _known_state(name, states, document, ("dynamics", name))
     for name in states:
         if name not in form.dynamics:
-            raise document.error(("dynamics",), f"'dynamics' has no expression for '{name}'; add it")
+            raise document.error(
+                ("dynamics",), f"'dynamics' has no expression for '{name}'; add it"
+            )
     ordered = {name: form.dynamics[name] for name in states}
     dynamics = _map("dynamics", ordered, names, x, u, document)
     measurement = _map("measurement", form.measurement, names, x, u, document)
@@ -194,8 +197,8 @@ def _check_start(model: NonlinearModel, start: Array, document: Document) -> Non
                 if not np.isfinite(values[i]).all():
                     raise document.error(
                         (kind, name),
-                        f"'{shown(name)}' has no finite {what} at the start of the truth (a division "
-                        "by zero?); change it, or 'start'",
+                        f"'{shown(name)}' has no finite {what} at the start of the truth (a "
+                        "division by zero?); change it, or 'start'",
                     )
 
 
@@ -206,8 +209,8 @@ def _inputs(form: NonlinearForm, n_steps: int, document: Document) -> Array:
         if len(values) != n_steps:
             raise document.error(
                 ("inputs", name),
-                f"'{name}' has {len(values)} numbers and there are {n_steps} steps; give a number, or "
-                "one for each step",
+                f"'{name}' has {len(values)} numbers and there are {n_steps} steps; give a "
+                "number, or one for each step",
             )
     rows = n_steps if lists else 1
     columns = [
