@@ -1,7 +1,7 @@
 """Slow, obvious oracles of the set-membership filter: one run at a time, as it is written down.
 
-No code is shared with the package: remainders by a fine scan, fusion as Otanez 2004 prints it, in as
-many digits as are asked for.
+No code is shared with the package: remainders by a fine scan, fusion as Otanez 2004 prints it, in
+as many digits as are asked for.
 """
 
 import math
@@ -63,7 +63,7 @@ def printed_fusion(centre, P, y, C, R, rho, digits=60):
 
 
 def plain_filter(y, Q, R, centre, shape, rho=0.05, at=None):
-    """The filter over measurements (n_steps, 2); `at` a fixed operating point, else its own centre."""
+    """The filter over measurements (n_steps, 2); `at`: an operating point, else its own centre."""
     centres, shapes = [], []
     for scan in y:
         point = centre if at is None else at

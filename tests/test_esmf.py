@@ -164,7 +164,9 @@ def test_models_are_chosen_in_order_and_more_calmly_by_sigma(drawn, outcomes):
     assert all(switches["trace_sigma"] <= number for number in switches.values())
 
 
-CRITERIA = [f"{size}_{of}" for size in ("trace", "determinant", "eigenvalue") for of in ("sigma", "q")]
+CRITERIA = [
+    f"{size}_{of}" for size in ("trace", "determinant", "eigenvalue") for of in ("sigma", "q")
+]
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)

@@ -33,7 +33,9 @@ def test_the_range_of_a_wave_less_its_tangent_is_exact(centre, low, width):
     g = np.cos(t) - np.cos(centre) + np.sin(centre) * (t - centre)
     assert least <= g.min()
     assert most >= g.max()
-    grid = 0.5 * (width / 40_000) ** 2 + 1e-11  # what a parabola of curvature 1 hides between points
+    grid = (
+        0.5 * (width / 40_000) ** 2 + 1e-11
+    )  # what a parabola of curvature 1 hides between points
     assert least >= g.min() - grid
     assert most <= g.max() + grid
 
