@@ -3,15 +3,18 @@
 import functools
 import threading
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridtrack.bounded import BoundedTruth, Opponent
 from hybridtrack.config import Experiment, Window
+from hybridtrack.containment import Names as SetNames
+from hybridtrack.containment import NoiseTally, SetTally
 from hybridtrack.delays import Delays, DelayTally, merge_delays
 from hybridtrack.errors import Stopped
-from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates
+from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates, SetsAtWork
 from hybridtrack.models import Array, Itself, JumpMarkovModel, ModeBank
 from hybridtrack.roots import square_root
 from hybridtrack.scoring import Given, Names, all_below, as_measured, blank_sheet
@@ -166,6 +169,17 @@ def _prepared_for_one(
     return estimator.one.prepare(settings, _model_of_one(bank, step_s, covariance, even))
 
 
+def _one_step(running: SetsAtWork, prepared: Any) -> Callable[[Array], tuple[Array, Array]]:
+    """A filter as an adversary sees it: measurements (lanes, n_y) in, its next ellipsoid out."""
+
+    def advance(measurements: Array) -> tuple[Array, Array]:
+        scan = np.ascontiguousarray(measurements.T)[np.newaxis]
+        estimates = running.advance(prepared, scan)
+        return estimates.mean[0].T, np.moveaxis(running.sets.shape[0], -1, 0)
+
+    return advance
+
+
 class _Block:
     """The state of a block on its way through the spans."""
 
@@ -194,6 +208,9 @@ class _Block:
         self._sheet = blank_sheet(SPAN_STEPS, self._lanes)
         self._tallies: dict[str, Tally] = {}
         self._watched: dict[str, DelayTally] = {}
+        self._sets: dict[str, SetTally] = {}
+        names = tuple(window.name for window in experiment.windows)
+        self._noise = NoiseTally(names, task.runs) if experiment.nonlinear else None
         self._shares = {
             name: Moments(*(np.zeros(self._n_steps) for _ in range(3)))
             for name in experiment.truth_modes
@@ -213,6 +230,8 @@ class _Block:
         for span in spans(self._n_steps, SPAN_STEPS):
             if stop.is_set():
                 raise Stopped
+            if isinstance(self._case.truth, BoundedTruth) and not self._running:
+                self._start_nonlinear(self._case.truth, stop)
             scans = self._simulation.advance(span)
             if not self._running:
                 self._start(scans, stop)
@@ -242,6 +261,12 @@ class _Block:
                 sums |= {(label, *cell): totals for cell, totals in tally.sums()}
                 if tally.final_bins.size:
                     final_bins[label] = tally.final_bins
+            own = self._noise if label == RAW else self._sets.get(label)
+            if own is not None:
+                sums |= {(label, *cell): totals for cell, totals in own.sums()}
+            if label in self._sets:
+                of_sets = self._sets[label].steps()
+                steps |= {(label, quantity): moments for quantity, moments in of_sets}
             if label in self._watched:
                 watched = self._watched[label]
                 delays[label] = watched.delays(self._status[label] == 0)
@@ -306,6 +331,26 @@ class _Block:
                     sojourns(self._case.truth),
                 )
 
+    def _start_nonlinear(self, truth: BoundedTruth, stop: threading.Event) -> None:
+        """Filters of a nonlinear model, and the adversary's own copy of the one it plays against."""
+        experiment, initial = self._experiment, self._experiment.initial
+        model = experiment.nonlinear
+        assert model is not None
+        mean = np.repeat(initial.mean[:, np.newaxis], self._lanes, axis=1)
+        if initial.follows_truth:
+            mean = self._simulation.initial_state.copy()
+        self._first_step = 0
+        leading = experiment.compare_with  # goes first, so that its scores are at hand
+        for chosen in sorted(experiment.estimators, key=lambda c: c.label != leading):
+            prepared = chosen.estimator.prepare(chosen.settings, model)
+            self._first[chosen.label] = prepared
+            begin = functools.partial(chosen.estimator.begin, chosen.settings, prepared, mean)
+            self._running[chosen.label] = begin(stop)
+            if chosen.label == truth.against:
+                start = np.repeat(model.initial_shape[np.newaxis], self._lanes, axis=0)
+                shadow: Any = begin(stop)
+                self._simulation.oppose(Opponent(mean.T, start, _one_step(shadow, prepared)))
+
     def _prepared(self, span: slice) -> dict[str, Any]:
         """Each estimator for the steps of a span; estimators of one bank share its matrices."""
         if self._steps_are_even:
@@ -329,6 +374,8 @@ class _Block:
         """Filter and score scans that none of the filters started from."""
         held = self._windows(span, scans.truth) if self._held is None else self._held[span]
         self._score(span, RAW, scans, held, as_measured(scans.measurements))
+        if self._noise is not None:
+            self._noise.add(self._simulation.noise_outside, held)
         prepared = self._prepared(span)
         covariance = self._task.tracks > 0
         for label, running in self._running.items():
@@ -338,6 +385,8 @@ class _Block:
             )
             self._note_status(span, label, estimates)
             self._score(span, label, scans, held, estimates)
+            if self._experiment.nonlinear is not None:
+                self._score_sets(span, label, cast(SetsAtWork, running), scans, held, estimates)
             if label in self._watched:
                 self._watched[label].add(span.start, scans.truth.mode, estimates.mode_probabilities)
             self._keep_estimates(span, label, running, estimates)
@@ -361,12 +410,32 @@ class _Block:
             self._tallies[label] = self._begin_tally(label, estimates)
         self._tallies[label].add(span.start, scans, held, estimates)
 
+    def _score_sets(
+        self,
+        span: slice,
+        label: str,
+        running: SetsAtWork,
+        scans: Scans,
+        held: NDArray[np.bool_],
+        estimates: Estimates,
+    ) -> None:
+        model = self._experiment.nonlinear
+        assert model is not None
+        if label not in self._sets:
+            windows = tuple(window.name for window in self._experiment.windows)
+            names = SetNames(running.state_names, model.angles, running.point_names, windows)
+            self._sets[label] = SetTally(names, self._case.times_s[1:], self._task.runs)
+        self._sets[label].add(span, scans.truth.state, estimates.mean, running.sets, held)
+
     def _begin_tally(self, label: str, estimates: Estimates) -> Tally:
         experiment, running = self._experiment, self._running.get(label)
+        measured = tuple("xyz"[: estimates.mean.shape[1]])
+        if experiment.nonlinear is not None:
+            measured = experiment.nonlinear.measurement_names
         names = Names(
             self._simulation.state_names,
             experiment.truth_modes,
-            running.state_names if running else tuple("xyz"[: estimates.mean.shape[1]]),
+            running.state_names if running else measured,
             running.mode_names if running else (),
         )
         leading = self._tallies.get(experiment.compare_with or "")
@@ -423,13 +492,18 @@ class _Block:
             self._keep(span, TRUTH, name, scans.truth.state[:, e])
         if self._experiment.truth_modes:
             self._keep(span, TRUTH, "mode", scans.truth.mode.astype(np.float64))
+        model = self._experiment.nonlinear
         for m in range(scans.measurements.shape[1]):
-            self._keep(span, "measurement", "xy"[m], scans.measurements[:, m])
+            name = "xy"[m] if model is None else model.measurement_names[m]
+            self._keep(span, "measurement", name, scans.measurements[:, m])
 
     def _keep_estimates(
         self, span: slice, label: str, running: AtWork, estimates: Estimates
     ) -> None:
         if not self._task.tracks:
+            return
+        if self._experiment.nonlinear is not None:
+            self._keep_sets(span, label, cast(SetsAtWork, running), estimates)
             return
         for e, name in enumerate(running.state_names):
             self._keep(span, label, name, estimates.mean[:, e])
@@ -442,6 +516,15 @@ class _Block:
         if len(estimates.final_mode_probability):
             values = estimates.final_mode_probability
             self._keep(span, label, "final_mode_probability", values)
+
+    def _keep_sets(
+        self, span: slice, label: str, running: SetsAtWork, estimates: Estimates
+    ) -> None:
+        for e, name in enumerate(running.state_names):
+            self._keep(span, label, name, estimates.mean[:, e])
+            self._keep(span, label, f"bound:{name}", np.sqrt(running.sets.shape[:, e, e]))
+        if running.point_names:
+            self._keep(span, label, "model", running.sets.chosen + 1.0)
 
     def _keep(self, span: slice, label: str, quantity: str, values: Array) -> None:
         for run in range(self._task.tracks):

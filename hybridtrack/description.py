@@ -5,10 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hybridtrack.containment import set_metrics
 from hybridtrack.estimators import Estimator
 from hybridtrack.models import Array, ModeBank
+from hybridtrack.nonlinear import NonlinearModel
 from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case, sojourns, step_lengths
+from hybridtrack.statistics import METRICS, QUANTITIES, Metric
 from hybridtrack.verdicts import AnalysisClaim, Claim
 
 
@@ -66,6 +69,23 @@ class Experiment(NamedTuple):
     analysis_claims: tuple[AnalysisClaim, ...]
     analyses: Mapping[str, Any]  # settings by analysis
     resolved: dict[str, Any]  # the scenario as it can be run again
+    nonlinear: NonlinearModel | None = None  # instead of a bank of modes, which is empty then
+    point_names: tuple[str, ...] = ()  # of operating points, of the estimator with the most
+
+    @property
+    def metrics(self) -> Mapping[str, Metric]:
+        """Every metric that an estimator here may have, by name."""
+        if self.nonlinear is None:
+            return METRICS
+        return {**METRICS, **set_metrics(self.nonlinear.state_names, self.point_names)}
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What they are made of, in the order of runs.parquet."""
+        if self.nonlinear is None:
+            return QUANTITIES
+        own = set_metrics(self.nonlinear.state_names, self.point_names).values()
+        return (*QUANTITIES, *dict.fromkeys(metric.quantity for metric in own))
 
     def switches(self, case: int) -> bool:
         """Whether the truth of a case may change its mode."""

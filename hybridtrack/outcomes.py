@@ -1,7 +1,7 @@
 """From merged statistics to the rows of a run folder's tables, verdicts among them."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ def runs_table(experiment: Experiment, blocks: list[BlockResult]) -> pa.Table:
         "window": columns.texts([window.name for window in windows] * len(rows), run.size),
         "status": number(status[:, np.newaxis]),
     }
-    for quantity in QUANTITIES:
+    for quantity in experiment.quantities:
         sums, counts = np.full(shape, np.nan), np.zeros(shape, dtype=np.int64)
         for i, label in enumerate(rows):
             for j, chosen in enumerate(windows):
@@ -176,7 +176,7 @@ def summary_rows(experiment: Experiment, cases: list[GroupStatistics]) -> dict[s
     rows: list[tuple[Any, ...]] = []
     for label in labels(experiment):
         for window in experiment.windows:
-            for name, metric in METRICS.items():
+            for name, metric in experiment.metrics.items():
                 estimate = _pooled(cases, label, window.name, metric)
                 if not math.isnan(estimate.value):
                     rows.append((label, name, window.name, *estimate))
@@ -212,8 +212,10 @@ Pair = tuple[str, str, str]  # first and second estimator, window
 class Pairs:
     """Pairs of estimators compared over the same runs, which come shard by shard."""
 
-    def __init__(self, wanted: Iterable[Pair]) -> None:
-        # By case; leading axis of the moments: QUANTITIES.
+    def __init__(self, wanted: Iterable[Pair], metrics: Mapping[str, Metric] = METRICS) -> None:
+        """metrics: those that there are."""
+        self._metrics, self._quantities = metrics, list(QUANTITIES)
+        # By case; leading axis of the moments: the quantities.
         self._moments: dict[Pair, dict[int, VectorMoments]] = {pair: {} for pair in wanted}
 
     def add(self, runs: pa.Table) -> None:
@@ -223,8 +225,12 @@ class Pairs:
         """
         labels, windows = (columns.names_in(runs[column]) for column in ("estimator", "window"))
         shape = (len(labels), len(windows), -1)
+        names = [name for name in runs.column_names if name.endswith("_sum")]
+        self._quantities = [name.removesuffix("_sum") for name in names]
         sums, numbers = (
-            np.stack([columns.as_numpy(runs[f"{q}_{kind}"]).reshape(shape) for q in QUANTITIES])
+            np.stack(
+                [columns.as_numpy(runs[f"{q}_{kind}"]).reshape(shape) for q in self._quantities]
+            )
             for kind in ("sum", "count")
         )
         sound = columns.as_numpy(runs["status"]).reshape(shape)[:, 0] == 0
@@ -243,10 +249,10 @@ class Pairs:
 
     def compare(self, pair: Pair, metric: str) -> Paired:
         """A metric of a pair; where one is raw, at the scans that it has."""
-        quantity, root = METRICS[metric].quantity, METRICS[metric].root
+        quantity, root = self._metrics[metric].quantity, self._metrics[metric].root
         if RAW in pair[:2] and quantity == POSITION:  # no measurement where the scan is missed
             quantity = POSITION_AT_SCANS
-        q = QUANTITIES.index(quantity)
+        q = self._quantities.index(quantity)
         cases = [VectorMoments(*(of[q] for of in case)) for case in self._moments[pair].values()]
         return compare(cases, root)
 
@@ -260,7 +266,7 @@ def pairs_wanted(experiment: Experiment) -> Pairs:
             firsts = (first for first in labels(experiment) if first != second)
             wanted |= dict.fromkeys((first, second, window.name) for first in firsts)
     claimed = ((*c.compare, c.window) for c in experiment.claims if c.compare is not None)
-    return Pairs(wanted | dict.fromkeys(claimed))
+    return Pairs(wanted | dict.fromkeys(claimed), experiment.metrics)
 
 
 def paired(path: Path, first: str, second: str, metric: str, window: str) -> Paired:
@@ -279,7 +285,7 @@ def comparisons_rows(experiment: Experiment, pairs: Pairs) -> dict[str, Any]:
     for window in experiment.windows if second is not None else ():
         assert second is not None
         for first in labels(experiment):
-            for metric in METRICS if first != second else ():
+            for metric in experiment.metrics if first != second else ():
                 pair = pairs.compare((first, second, window.name), metric)
                 n = pair.difference.n_runs
                 if n:
@@ -325,5 +331,5 @@ def _judge(
         pair = pairs.compare((*claim.compare, claim.window), claim.metric)
         return judge_comparison(claim, pair, assumed)
     assert claim.estimator is not None
-    ours = _pooled(cases, claim.estimator, claim.window, METRICS[claim.metric])
+    ours = _pooled(cases, claim.estimator, claim.window, experiment.metrics[claim.metric])
     return judge_figure(claim, ours, assumed)

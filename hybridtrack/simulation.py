@@ -5,7 +5,6 @@ thrown away, and each purpose has a stream of its own that is read on from span 
 depends neither on how many runs were asked for nor on the length of spans.
 """
 
-import enum
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -13,25 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridtrack.bounded import BoundedRuns, BoundedTruth, Opponent
 from hybridtrack.errors import UserError
 from hybridtrack.jumps import ChainTruth, JumpRuns, Modes
 from hybridtrack.models import Array
+from hybridtrack.purposes import Purpose
 from hybridtrack.sensors import Noise, Sensor
 
 BLOCK_RUNS = 256  # runs drawn and filtered together
 NOT_FORESEEN: Array = np.zeros((0, 1))
-
-
-class Purpose(enum.IntEnum):
-    """What a random stream is for."""
-
-    INITIAL_STATE = 0
-    MODE_SEQUENCE = 1
-    PROCESS_NOISE = 2
-    MEASUREMENT_NOISE = 3
-    DETECTION = 4
-    OUTLIERS = 5
-    INITIAL_ESTIMATE = 6
 
 
 def stream(seed: int, case: int, block: int, purpose: Purpose) -> np.random.Generator:
@@ -118,7 +107,7 @@ def _along(leg: Leg, elapsed_s: Array, speed: float, position: Array, heading: f
 
 # ---- truth and measurements of a span --------------------------------------------------------
 
-Truth = FixedTruth | ChainTruth
+Truth = FixedTruth | ChainTruth | BoundedTruth
 
 
 class TruthSpan(NamedTuple):
@@ -202,8 +191,14 @@ class BlockSimulation:
         self._noise = Noise(sensor.noise_covariance)
         self._may_be_outliers = sensor.may_be_outliers(case.times_s)
         self.fixed: TruthSpan | None = None  # the truth of all steps, if every run has the same
+        self.noise_outside = np.zeros((0, lanes, 2))  # of the last span, see BoundedRuns
+        self._bounded: BoundedRuns | None = None
         truth = case.truth
-        if isinstance(truth, ChainTruth):
+        if isinstance(truth, BoundedTruth):
+            self.state_names = truth.model.state_names
+            self._bounded = BoundedRuns(truth, self._stream, BLOCK_RUNS, lanes)
+            self.initial_state = self._bounded.state.T.copy()
+        elif isinstance(truth, ChainTruth):
             self.state_names = truth.bank.state_names
             n_x = len(self.state_names)
             draws = self._stream(Purpose.INITIAL_STATE).standard_normal((n_x, BLOCK_RUNS))
@@ -240,12 +235,29 @@ class BlockSimulation:
         draws = self._stream(Purpose.INITIAL_ESTIMATE).standard_normal((n_x, BLOCK_RUNS))
         return draws[:, : self._lanes]
 
+    def oppose(self, opponent: Opponent) -> None:
+        """Give an adversary the filter that it plays against, at k = 0."""
+        assert self._bounded is not None
+        self._bounded.opponent = opponent
+
     def advance(self, span: slice) -> Scans:
         """Truth and measurements of the next span of steps."""
+        if self._bounded is not None:
+            return self._advance_bounded(self._bounded, span)
         truth, measurements = self._draw(span)
         lanes = self._lanes
         kept = truth.each(lambda array: np.ascontiguousarray(array[..., :lanes]))
         return Scans(kept, np.ascontiguousarray(measurements[..., :lanes]))
+
+    def _advance_bounded(self, runs: BoundedRuns, span: slice) -> Scans:
+        states, measurements, self.noise_outside = runs.advance(span.stop - span.start)
+        steps = (len(states), 1)
+        truth = TruthSpan(
+            np.ascontiguousarray(np.swapaxes(states, 1, 2)),
+            np.full(steps, -1, dtype=np.int64),
+            np.full(steps, np.inf),
+        )
+        return Scans(truth, np.ascontiguousarray(np.swapaxes(measurements, 1, 2)))
 
     def _draw(self, span: slice) -> Scans:
         truth = self._advance_truth(span)
@@ -286,7 +298,7 @@ class BlockSimulation:
 
 def sojourns(truth: Truth) -> Modes | None:
     """How many steps each mode lasts, from the start on (n_sojourns,); None where runs differ."""
-    if isinstance(truth, ChainTruth):
+    if isinstance(truth, ChainTruth | BoundedTruth):
         return None
     switched = np.flatnonzero(truth.mode[2:] != truth.mode[1:-1]) + 1
     return np.diff(np.concatenate([[0], switched, [len(truth.mode) - 1]]))

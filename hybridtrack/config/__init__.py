@@ -6,8 +6,10 @@ from pathlib import Path
 from hybridtrack.compiled import PACKAGE
 from hybridtrack.config.build import build
 from hybridtrack.config.checks import nearest
+from hybridtrack.config.json_form import json_schema
 from hybridtrack.config.reader import Document, ScenarioError, read
-from hybridtrack.config.schema import json_schema
+from hybridtrack.config.nonlinear import build_nonlinear
+from hybridtrack.config.nonlinear_form import NonlinearForm
 from hybridtrack.config.validate import validate
 from hybridtrack.config.writer import dump
 from hybridtrack.description import ChosenEstimator, Experiment, Initial, Window
@@ -65,4 +67,7 @@ def load(config: str | Path, settings: Sequence[str] = ()) -> Experiment:
     document = read(path)
     for setting in settings:
         document = document.with_setting(setting)
-    return build(validate(document), document, path.parent)
+    form = validate(document)
+    if isinstance(form, NonlinearForm):
+        return build_nonlinear(form, document)
+    return build(form, document, path.parent)

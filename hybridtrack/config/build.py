@@ -9,6 +9,7 @@ import numpy as np
 from hybridtrack.analyses import analyses
 from hybridtrack.config import banks, checks, starts, truths
 from hybridtrack.config.claims import analysis_claim, built_claim
+from hybridtrack.config.nonlinear_form import AnyForm
 from hybridtrack.config.reader import Document, Keys, ScenarioError
 from hybridtrack.config.schema import ScenarioForm, WindowForm
 from hybridtrack.description import ChosenEstimator, Experiment, Initial, Window
@@ -40,16 +41,7 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
             f"'compare_with' is {form.compare_with}, which is no estimator here; "
             f"{checks.nearest(form.compare_with, tuple(form.estimators))}",
         )
-    most = max(len(s) for s in steps)
-    if form.scoring.skip_scans >= most:
-        raise document.error(
-            ("scoring", "skip_scans"),
-            f"'skip_scans' is {form.scoring.skip_scans} of {most} scans; leave some to be scored",
-        )
-    windows = [Window("all", skip_scans=form.scoring.skip_scans)]
-    for name, window in form.windows.items():
-        windows.append(_window(name, window, form, truth_modes, document))
-        _check_span(name, window, cases, document)
+    windows = window_of(form, truth_modes, cases, document)
     sensor = truths.sensor(form, truth_modes, cases, initial.two_point, document)
     claims = tuple(
         built_claim(i, form, chosen, truth_modes, cases, sensor, document)
@@ -74,7 +66,7 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         estimators=chosen,
         compare_with=form.compare_with,
         error=form.scoring.error,
-        windows=tuple(windows),
+        windows=windows,
         runs=form.monte_carlo.runs,
         seed=form.monte_carlo.seed,
         keep_tracks=min(form.monte_carlo.keep_tracks, form.monte_carlo.runs),
@@ -115,10 +107,6 @@ def _check_recorded(
             )
 
 
-# Rows of the tables, and how the figures' legends call them.
-TAKEN_LABELS = ("raw", "truth", "measurement", "measurements")
-
-
 def _check_modes_can_be_told(
     label: str, truth_modes: tuple[str, ...], bank: ModeBank, document: Document
 ) -> None:
@@ -145,15 +133,7 @@ def _estimator(
     steps_s: Sequence[Array],
     document: Document,
 ) -> ChosenEstimator:
-    if label in TAKEN_LABELS:
-        raise document.error(
-            ("estimators", label),
-            f"'{label}' means something else in tables and figures; call it otherwise",
-        )
-    if label.startswith("_"):  # no legend of matplotlib's shows these
-        raise document.error(
-            ("estimators", label), f"'{label}' begins with _; begin with a letter or a digit"
-        )
+    checks.label(label, document)
     chosen: Any = form.estimators[label]
     estimator = estimators()[chosen.type]
     values = {key: value for key, value in chosen if key != "type"}
@@ -174,10 +154,27 @@ def _estimator(
     return ChosenEstimator(label, estimator, settings, bank)
 
 
+def window_of(
+    form: AnyForm, truth_modes: tuple[str, ...], cases: tuple[Case, ...], document: Document
+) -> tuple[Window, ...]:
+    """The scenario's windows, after that of all scored steps."""
+    most = max(len(case.times_s) - 1 for case in cases)
+    if form.scoring.skip_scans >= most:
+        raise document.error(
+            ("scoring", "skip_scans"),
+            f"'skip_scans' is {form.scoring.skip_scans} of {most} scans; leave some to be scored",
+        )
+    windows = [Window("all", skip_scans=form.scoring.skip_scans)]
+    for name, window in form.windows.items():
+        windows.append(_window(name, window, form, truth_modes, document))
+        _check_span(name, window, cases, document)
+    return tuple(windows)
+
+
 def _window(
     name: str,
     window: WindowForm,
-    form: ScenarioForm,
+    form: AnyForm,
     truth_modes: tuple[str, ...],
     document: Document,
 ) -> Window:

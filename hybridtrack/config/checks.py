@@ -10,6 +10,8 @@ from hybridtrack.config.reader import Document, Keys
 from hybridtrack.models import Array
 
 ROUNDING = 1e-9  # what decimals written by hand may leave over
+# Rows of the tables, and how the figures' legends call them.
+TAKEN_LABELS = ("raw", "truth", "measurement", "measurements")
 
 
 def nearest(given: Any, names: Sequence[str]) -> str:
@@ -197,3 +199,16 @@ def known_mode(
     if name not in names:
         there = nearest(name, names) if names else "the truth has no modes, so leave it out"
         raise document.error(path, f"mode '{name}' is not defined; {there}")
+
+
+def label(name: str, document: Document) -> None:
+    """An estimator's label that tables and figures can show."""
+    if name in TAKEN_LABELS:
+        raise document.error(
+            ("estimators", name),
+            f"'{name}' means something else in tables and figures; call it otherwise",
+        )
+    if name.startswith("_"):  # no legend of matplotlib's shows these
+        raise document.error(
+            ("estimators", name), f"'{name}' begins with _; begin with a letter or a digit"
+        )

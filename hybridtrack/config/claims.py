@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 
 from hybridtrack.config import checks
-from hybridtrack.config.exact import exact_figure
+from hybridtrack.config.exact import WITH_PLACE, exact_figure
 from hybridtrack.config.reader import Document, Keys
+from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
 from hybridtrack.config.schema import ClaimForm, ScenarioForm
+from hybridtrack.containment import NOISE, set_metrics
 from hybridtrack.description import ChosenEstimator
 from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case
@@ -54,7 +56,7 @@ def analysis_claim(i: int, form: ScenarioForm, document: Document) -> AnalysisCl
 
 def built_claim(
     i: int,
-    form: ScenarioForm,
+    form: AnyForm,
     chosen: tuple[ChosenEstimator, ...],
     truth_modes: tuple[str, ...],
     cases: tuple[Case, ...],
@@ -70,6 +72,8 @@ def built_claim(
         raise document.error(path, "a claim needs one of 'estimator', 'compare' and 'figure'")
     exact = None
     for key in ("where", "than"):
+        if key == "where" and claim.figure in WITH_PLACE:
+            continue
         if getattr(claim, key) is not None:
             raise document.error(
                 (*path, key),
@@ -88,6 +92,8 @@ def built_claim(
             (*path, "sign"), f"'sign' {claim.sign} has no place in this claim; remove it"
         )
     figure = claim.figure if claim.mode is None else f"{claim.figure} of {claim.mode}"
+    if claim.where is not None:
+        figure = f"{claim.figure} ({', '.join(f'{k} {v}' for k, v in claim.where.items())})"
     value = 1.0 if claim.sign == "equal" else claim.value
     return Claim(
         claim=claim.claim,
@@ -114,7 +120,7 @@ def _check_exact(claim: ClaimForm, document: Document, path: Keys) -> None:
 
 def _check_of_runs(
     claim: ClaimForm,
-    form: ScenarioForm,
+    form: AnyForm,
     chosen: tuple[ChosenEstimator, ...],
     truth_modes: tuple[str, ...],
     document: Document,
@@ -133,7 +139,9 @@ def _check_of_runs(
                     (*path, key),
                     f"'{label}' is no estimator here; {checks.nearest(label, labels)}",
                 )
-            if label is not None:
+            if label is not None and isinstance(form, NonlinearForm):
+                _check_set_metric(label, claim.metric, form, document, path)
+            elif label is not None:
                 _check_metric(label, claim.metric, chosen, truth_modes, document, path)
     if claim.compare is not None and claim.compare[0] == claim.compare[1]:
         raise document.error(
@@ -187,6 +195,27 @@ def _check_metric(
         raise document.error(
             (*path, "metric"), f"'metric' is {metric}, which {label} doesn't have; it has {there}"
         )
+
+
+def _check_set_metric(
+    label: str, metric: str, form: NonlinearForm, document: Document, path: Keys
+) -> None:
+    """A metric of sets, of position where it is measured or estimated, or of the noise."""
+    own = set_metrics(tuple(form.states), point_names(form))
+    there = [name for name in own if (name in NOISE) == (label == "raw")]
+    seen = form.measurement if label == "raw" else form.states
+    there += [name for name in METRICS if name.startswith("position_") and {*"xy"} & {*seen}]
+    if metric not in there:
+        raise document.error(
+            (*path, "metric"),
+            f"'metric' is {metric}, which {label} doesn't have; it has {', '.join(there)}",
+        )
+
+
+def point_names(form: NonlinearForm) -> tuple[str, ...]:
+    """Operating points by number, of the estimator that has the most."""
+    most = max(len(getattr(one, "operating_points", ())) for one in form.estimators.values())
+    return tuple(str(i + 1) for i in range(most))
 
 
 def _of_modes(one: ChosenEstimator, truth: bool) -> Iterator[str]:

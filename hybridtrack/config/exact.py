@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hybridtrack.bounded import BoundedTruth
 from hybridtrack.chains import (
     expected_steps_in_mode,
     expected_steps_to_end,
@@ -23,6 +24,7 @@ EXACT_FIGURES = (
     "manoeuvring_index",
 )
 OF_MODES = ("expected_steps_in_mode", "manoeuvring_index")
+WITH_PLACE = ("jacobian", "end_point")  # of nonlinear dynamics; `where` says which element
 
 
 def exact_figure(
@@ -30,6 +32,8 @@ def exact_figure(
 ) -> float:
     """The value of a claim's `figure`: of the truth's chain, or of one of its modes."""
     name, truth = claim.figure, cases[0].truth
+    if isinstance(truth, BoundedTruth):
+        return _of_dynamics(claim, truth, len(cases[0].times_s) - 1, document, path)
     if name not in EXACT_FIGURES:
         raise document.error(
             (*path, "figure"),
@@ -61,6 +65,39 @@ def exact_figure(
             "'continuation_probability'",
         )
     return expected_steps_to_end(truth.bound.continuation_probability)
+
+
+def _of_dynamics(
+    claim: ClaimForm, truth: BoundedTruth, n_steps: int, document: Document, path: Keys
+) -> float:
+    """An element of df/dx at a state, or where the course without noise ends."""
+    model, name = truth.model, claim.figure
+    if name not in WITH_PLACE:
+        raise document.error(
+            (*path, "figure"), f"'figure' is {name}; {checks.nearest(str(name), WITH_PLACE)}"
+        )
+    where = dict(claim.where or {})
+    states = model.state_names
+    asked = ("row", "column") if name == "jacobian" else ("state",)
+    chosen = [where.pop(key, None) for key in asked]
+    for key, value in zip(asked, chosen, strict=True):
+        if value not in states:
+            raise document.error(
+                (*path, "where"),
+                f"'where' of '{name}' needs '{key}', a state; there are {', '.join(states)}",
+            )
+    for key, value in where.items():
+        if key not in states or not isinstance(value, int | float) or name == "end_point":
+            raise document.error(
+                (*path, "where"),
+                f"'{key}' has no place in 'where'; it takes {', '.join(asked)}"
+                + (", and a number for every state that isn't 0" if name == "jacobian" else ""),
+            )
+    places = [states.index(str(value)) for value in chosen]
+    if name == "end_point":
+        return float(model.course(truth.start, n_steps)[-1, places[0]])
+    at = np.array([[float(where.get(state, 0.0)) for state in states]])
+    return float(model.dynamics.jacobian(at, model.inputs_at(0))[0, places[0], places[1]])
 
 
 def _mode(claim: ClaimForm, bank: ModeBank, document: Document, path: Keys) -> int:

@@ -18,6 +18,7 @@ from pydantic_core import PydanticCustomError
 
 from hybridtrack.analyses import analyses
 from hybridtrack.config import units
+from hybridtrack.containment import FAMILIES, FLAGS, NOISE
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
 from hybridtrack.statistics import METRICS
@@ -155,7 +156,9 @@ def _settings_form(kind: str, one: Any, **fields: Any) -> type[Form]:
     return create_model(f"{kind}_{one.name}", __base__=Form, __doc__=one.summary, **fields)
 
 
-def _tagged(forms: dict[str, type[Form]], key: str, otherwise: str) -> Any:
+def tagged(forms: dict[str, type[Form]], key: str, otherwise: str) -> Any:
+    """Which of the forms it is, the value under `key` says."""
+
     def tag(value: Any) -> str:
         chosen = value.get(key) if isinstance(value, dict) else getattr(value, key, None)
         return otherwise if chosen is None else str(chosen)
@@ -185,8 +188,12 @@ else:
         __doc__="Settings of `hybridtrack analyze`, by analysis.",
         **{name: (form, form()) for name, form in ANALYSIS_FORMS.items()},
     )
-    ModeUnion = _tagged(MOTION_FORMS, "motion", "matrices")
-    EstimatorUnion = _tagged(ESTIMATOR_FORMS, "type", "")
+    ModeUnion = tagged(MOTION_FORMS, "motion", "matrices")
+    EstimatorUnion = tagged(
+        {n: form for n, form in ESTIMATOR_FORMS.items() if not estimators()[n].nonlinear},
+        "type",
+        "",
+    )
 
 
 class ChainForm(Form):
@@ -302,7 +309,7 @@ class ClaimForm(Form):
     """
 
     claim: str
-    metric: Annotated[str | None, Field(json_schema_extra={"enum": [*METRICS, None]})] = None
+    metric: Annotated[str | None, Field(json_schema_extra={"enum": [*METRICS, *FLAGS, *NOISE, None]})] = None
     figure: str | None = None
     analysis: AnalysisName | None = None
     where: Cells | None = None
@@ -322,9 +329,11 @@ class ClaimForm(Form):
     @pydantic.field_validator("metric")
     @classmethod
     def _known_metric(cls, metric: str | None) -> str | None:
-        if metric is not None and metric not in METRICS:
+        known = (*METRICS, *FLAGS, *NOISE)
+        family, colon, _ = (metric or "").partition(":")
+        if metric is not None and metric not in known and not (colon and family in FAMILIES):
             raise PydanticCustomError(
-                "unknown_metric", "must be one of {names}", {"names": ", ".join(METRICS)}
+                "unknown_metric", "must be one of {names}", {"names": ", ".join(known)}
             )
         return metric
 
@@ -353,36 +362,6 @@ class ScenarioForm(Form):
     analyses: AnalysesForm = Field(default={}, validate_default=True)
     monte_carlo: MonteCarloForm
     published: list[ClaimForm] = []
-
-
-def json_schema() -> dict[str, Any]:
-    """JSON Schema of a scenario for editors, every unit's spelling included."""
-    schema = ScenarioForm.model_json_schema()
-    _refuse_other_names(schema)
-    for form in (schema, *schema["$defs"].values()):
-        properties = form.get("properties", {})
-        for name in list(properties):
-            spelled = units.spellings(name)
-            for other in spelled[1:]:
-                properties[other] = properties[name]
-            if len(spelled) > 1 and name in form.get("required", []):
-                form["required"].remove(name)
-                form.setdefault("allOf", []).append(
-                    {"oneOf": [{"required": [key]} for key in spelled]}
-                )
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return schema
-
-
-def _refuse_other_names(node: Any) -> None:
-    """Names by `propertyNames`: `patternProperties` alone lets every other key pass unchecked."""
-    parts = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
-    for part in parts:
-        _refuse_other_names(part)
-    if isinstance(node, dict) and "patternProperties" in node:
-        ((pattern, value),) = node.pop("patternProperties").items()
-        node["additionalProperties"] = value
-        node["propertyNames"] = {**node.get("propertyNames", {}), "pattern": pattern}
 
 
 def is_number(value: Any) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from hybridtrack.chains import Bound
 from hybridtrack.config import banks, checks, starts
 from hybridtrack.config.reader import Document, Keys
-from hybridtrack.config.schema import FileForm, RecordingForm, ScenarioForm, TruthForm
+from hybridtrack.config.schema import ClockForm, FileForm, RecordingForm, ScenarioForm, TruthForm
 from hybridtrack.config.validate import as_written
 from hybridtrack.errors import UserError
 from hybridtrack.jumps import ChainTruth
@@ -45,7 +45,9 @@ def cases(
         except UserError as error:
             place = _recording_place(truth.recording, str(error), document)
             raise document.error(place, str(error)) from None
-    times_s = _times(form, document)
+    if form.clock is None:
+        raise document.error((), "'clock' is missing; add it")
+    times_s = times_of(form.clock, document)
     if truth.legs is not None:
         fixed = _legs(form, truth, times_s, bank.names, document)
         return bank.names, (Case(form.name, times_s, fixed),)
@@ -112,10 +114,8 @@ def _is_about(form: FileForm, sentence: str) -> bool:
     return Path(form.file).name in sentence or bool(form.package and form.package in sentence)
 
 
-def _times(form: ScenarioForm, document: Document) -> Array:
-    clock = form.clock
-    if clock is None:
-        raise document.error((), "'clock' is missing; add it")
+def times_of(clock: ClockForm, document: Document) -> Array:
+    """Times (n_steps + 1,) from k = 0."""
     if clock.times_s is not None:
         if clock.step_s is not None or clock.duration_s is not None:
             raise document.error(

@@ -8,7 +8,9 @@ from pydantic import ValidationError
 from hybridtrack.config import units
 from hybridtrack.config.checks import nearest
 from hybridtrack.config.reader import Document, Keys, ScenarioError, shown
+from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
 from hybridtrack.config.schema import MOTION_FORMS, MatricesForm, ModeForm, ScenarioForm
+from hybridtrack.estimators import estimators
 
 # Within these, no product of a few numbers overflows or vanishes: std^2, psd T^5, F P F'.
 SMALLEST, LARGEST = 1e-30, 1e30
@@ -16,10 +18,18 @@ SMALLEST, LARGEST = 1e-30, 1e30
 Mistake = Any  # one entry of pydantic's ValidationError.errors()
 
 
-def validate(document: Document) -> ScenarioForm:
-    """The document as a form. Raises ScenarioError about the first mistake in the file."""
+def validate(document: Document) -> AnyForm:
+    """The document as a form: with `dynamics`, or with modes.
+
+    Raises ScenarioError about the first mistake in the file.
+    """
+    if "dynamics" in document.data and "modes" in document.data:
+        raise document.error(
+            ("dynamics",), "a scenario has 'dynamics' or 'modes', and this has both; remove one"
+        )
+    kind: type[AnyForm] = NonlinearForm if "dynamics" in document.data else ScenarioForm
     try:
-        form = ScenarioForm.model_validate(document.data)
+        form = kind.model_validate(document.data)
     except ValidationError as error:
         raise _first_mistake(document, error) from None
     outside = [
@@ -228,6 +238,9 @@ def _motion_missing(document: Document, path: Keys) -> str:
 def _unknown_tag(document: Document, path: Keys, expected: str) -> str:
     names = [tag for tag in (t.strip("' ") for t in expected.split(",")) if tag != "matrices"]
     key, given = _tag_key(path), value_at(document, path)
+    if path[-1] == key and isinstance(given, str) and key == "type" and given in estimators():
+        needs = "'dynamics'" if estimators()[given].nonlinear else "'modes'"
+        return f"'type' is {given}, which is for scenarios with {needs}; there are {', '.join(names)}"
     if path[-1] == key and given is not None:
         return f"'{key}' is {_shown(document, path)}, which is not known; {nearest(given, names)}"
     at = path[:-1] if path[-1] == key else path

@@ -18,6 +18,7 @@ from hybridtrack.chains import Bound, on_supermodes
 from hybridtrack.estimators import _bank, _layout
 from hybridtrack.estimators._bank import NO_KNOWN_MODES, Recursion
 from hybridtrack.estimators._layout import Array, Estimates
+from hybridtrack.estimators._sets import Sets
 from hybridtrack.models import JumpMarkovModel
 
 __all__ = [
@@ -27,6 +28,8 @@ __all__ = [
     "Estimates",
     "Estimator",
     "Running",
+    "Sets",
+    "SetsAtWork",
     "estimators",
 ]
 
@@ -55,6 +58,13 @@ class AtWork(Protocol):
         ...
 
 
+class SetsAtWork(AtWork, Protocol):
+    """One that gives a set beside every estimate."""
+
+    point_names: tuple[str, ...]  # of its operating points, where it has some
+    sets: Sets  # those of the last span
+
+
 class Estimator(Protocol):
     """What a scenario can choose by its name."""
 
@@ -74,6 +84,11 @@ class Estimator(Protocol):
         """Smallest and largest value by setting."""
         ...
 
+    @property
+    def nonlinear(self) -> bool:
+        """Whether it is for a NonlinearModel, and gives sets (a SetsAtWork)."""
+        ...
+
     def is_told_modes(self, settings: Any) -> bool:
         """Whether it has to be given the true modes."""
         ...
@@ -91,8 +106,11 @@ class Estimator(Protocol):
         """
         ...
 
-    def prepare(self, settings: Any, model: JumpMarkovModel) -> Any:
-        """What it makes of a bank's model for some steps; kept for all blocks with such steps."""
+    def prepare(self, settings: Any, model: Any) -> Any:
+        """What it makes of a model for some steps; kept for all blocks with such steps.
+
+        model: a JumpMarkovModel, or a NonlinearModel where it is for these.
+        """
         ...
 
     def begin(
@@ -133,6 +151,11 @@ class BankEstimator(NamedTuple):
     def has_likelihoods(self) -> bool:
         """Always."""
         return True
+
+    @property
+    def nonlinear(self) -> bool:
+        """Never."""
+        return False
 
     def is_told_modes(self, settings: Any) -> bool:
         """Whether it has to be given the true modes."""

@@ -129,6 +129,7 @@ class BestSequences:
     }
 
     has_likelihoods = False
+    nonlinear = False
 
     def is_told_modes(self, settings: Settings) -> bool:
         """Never."""

@@ -1,0 +1,208 @@
+"""Truth under bounded noise: every kind of it, and an adversary.
+
+An ellipsoid Omega(0, Q) holds the noise that a set-membership filter believes in. Random noise
+inside it is far from its worst, so a filter that leaves out what it must not may look right under
+it: `persistent` noise stays at one place of the boundary for many steps, and an adversary chooses
+what hurts one filter most. A box of the same half-axes is not inside: its corners are sqrt(n)
+beyond. So isn't the printed noise of Otanez 2004, eq. 38, each component by itself a Gaussian that
+"passes only values within +-sigma", whichever way that is read.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hybridtrack.ellipsoids import inverse, quadratic
+from hybridtrack.models import Array
+from hybridtrack.nonlinear import NonlinearModel
+from hybridtrack.purposes import Purpose
+from hybridtrack.roots import square_root
+
+ELLIPSOID = ("none", "ball", "sphere", "persistent_ball", "adversary")
+BOX = ("box", "persistent_box")
+PRINTED = ("truncated_gaussian", "clipped_gaussian", "zeroed_gaussian")
+KINDS = (*ELLIPSOID, *BOX, *PRINTED)
+ASCENTS = 8  # of the adversary, each to the boundary point that the last one's slope points to
+ROUNDING = 1e-9  # a point on the boundary may lie so far outside
+
+Draws = Callable[[tuple[int, ...]], Array]
+
+
+class Noise(NamedTuple):
+    """How noise is drawn whose bound is the ellipsoid of `shape` (n, n)."""
+
+    kind: str
+    shape: Array
+    hold_steps: int  # of the persistent kinds: steps until the signs are drawn again
+
+
+class BoundedTruth(NamedTuple):
+    """A nonlinear truth with bounded noise, from one start."""
+
+    model: NonlinearModel
+    start: Array  # (n_x,)
+    spread: str  # none | ball | sphere: how starts lie in Omega(start, Sigma_0)
+    process: Noise
+    measurement: Noise
+    against: str | None = None  # the filter that the adversary plays
+
+
+class NoiseRuns:
+    """One noise of a block of runs, span by span."""
+
+    def __init__(self, noise: Noise, generator: np.random.Generator, runs: int) -> None:
+        """generator: the purpose's own stream, read on from span to span."""
+        self._noise, self._generator, self._runs = noise, generator, runs
+        self._root = square_root(noise.shape)
+        self._signs = np.zeros((runs, len(noise.shape)))
+        self._step = 0
+
+    def advance(self, steps: int) -> Array:
+        """Noise (steps, runs, n) of the next steps; directions for an adversary."""
+        n = len(self._noise.shape)
+        shape = (steps, self._runs, n)
+        kind = self._noise.kind
+        if kind == "none":
+            return np.zeros(shape)
+        if kind.startswith("persistent"):
+            unit = self._held_signs(steps)
+            unit = unit / np.sqrt(n) if kind == "persistent_ball" else unit
+        elif kind == "box":
+            unit = self._generator.uniform(-1.0, 1.0, shape)
+        elif kind in PRINTED:
+            unit = printed(kind, self._generator, shape)
+        else:
+            unit = self._generator.standard_normal(shape)
+            unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
+            if kind == "ball":
+                unit *= self._generator.random((*shape[:2], 1)) ** (1.0 / n)
+        result: Array = unit @ self._root.T
+        return result
+
+    def _held_signs(self, steps: int) -> Array:
+        signs = np.empty((steps, *self._signs.shape))
+        for k in range(steps):
+            if self._step % self._noise.hold_steps == 0:
+                self._signs = 2.0 * self._generator.integers(0, 2, self._signs.shape) - 1.0
+            signs[k] = self._signs
+            self._step += 1
+        return signs
+
+
+def printed(kind: str, generator: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Three readings of a standard Gaussian that "passes only values within +-1" (eq. 38).
+
+    truncated: drawn again until inside; clipped: moved to the end; zeroed: nothing passes.
+    """
+    if kind == "truncated_gaussian":
+        from scipy.special import ndtr, ndtri  # by the inverse of its distribution: one draw each
+
+        low = ndtr(-1.0)
+        truncated: Array = ndtri(low + (1.0 - 2.0 * low) * generator.random(shape))
+        return truncated
+    drawn = generator.standard_normal(shape)
+    if kind == "clipped_gaussian":
+        return np.clip(drawn, -1.0, 1.0)
+    return np.where(np.abs(drawn) <= 1.0, drawn, 0.0)
+
+
+def outside(noise: Array, shape: Array) -> Any:
+    """Which draws (...,) of noise (..., n) lie outside Omega(0, shape)."""
+    return quadratic(noise, np.broadcast_to(shape, (*noise.shape[:-1], *shape.shape))) > (
+        1.0 + ROUNDING
+    )
+
+
+class Opponent(NamedTuple):
+    """A filter as its adversary sees it: the ellipsoid at hand, and how it goes on."""
+
+    centre: Array  # (lanes, n_x)
+    shape: Array  # (lanes, n_x, n_x)
+    advance: Callable[[Array], tuple[Array, Array]]  # measurements (lanes, n_y) -> the next two
+
+
+class BoundedRuns:
+    """States and measurements of the runs of a block, span by span."""
+
+    def __init__(
+        self,
+        truth: BoundedTruth,
+        stream: Callable[[Any], np.random.Generator],
+        drawn: int,
+        lanes: int,
+    ) -> None:
+        """stream: by purpose; drawn: runs drawn, of which the first `lanes` are kept."""
+        self._truth, self._lanes = truth, lanes
+        self._process = NoiseRuns(truth.process, stream(Purpose.PROCESS_NOISE), drawn)
+        self._measurement = NoiseRuns(truth.measurement, stream(Purpose.MEASUREMENT_NOISE), drawn)
+        spread = Noise(truth.spread, truth.model.initial_shape, 1)
+        offset = NoiseRuns(spread, stream(Purpose.INITIAL_STATE), drawn).advance(1)[0, :lanes]
+        self.state = truth.start + offset
+        self.opponent: Opponent | None = None
+        self._step = 0
+
+    def advance(self, steps: int) -> tuple[Array, Array, Array]:
+        """States (steps, lanes, n_x), measurements (steps, lanes, n_y), and what lies outside.
+
+        The last is (steps, lanes, 2): 1 where the process noise, and where the measurement noise,
+        is outside its ellipsoid, else 0.
+        """
+        model, lanes = self._truth.model, self._lanes
+        w = self._process.advance(steps)[:, :lanes]
+        v = self._measurement.advance(steps)[:, :lanes]
+        states = np.empty((steps, lanes, len(model.state_names)))
+        measurements = np.empty((steps, lanes, len(model.measurement_names)))
+        for k in range(steps):
+            u = model.inputs_at(self._step)
+            ahead = model.dynamics.value(self.state, u)
+            if self._truth.against is not None:
+                w[k] = self._push(ahead, w[k], u)
+            self.state = states[k] = ahead + w[k]
+            clean = model.measurement.value(self.state, u)
+            if self._truth.against is not None:
+                v[k] = self._hide(clean, v[k], u)
+            measurements[k] = clean + v[k]
+            if self.opponent is not None:
+                centre, shape = self.opponent.advance(measurements[k])
+                self.opponent = self.opponent._replace(centre=centre, shape=shape)
+            self._step += 1
+        far = [outside(w, self._truth.process.shape), outside(v, self._truth.measurement.shape)]
+        return states, measurements, np.stack(far, axis=-1).astype(np.float64)
+
+    def _push(self, ahead: Array, direction: Array, u: Array) -> Array:
+        """Process noise on the boundary that drives the state out of the predicted ellipsoid.
+
+        It maximises (d + w)' M (d + w), d the error ahead of it and M the inverse of A Sigma A' + Q:
+        convex, so the boundary point in the direction of the slope is never worse.
+        """
+        assert self.opponent is not None
+        model, Q = self._truth.model, self._truth.process.shape
+        A = model.dynamics.jacobian(self.opponent.centre, u)
+        M = inverse(A @ self.opponent.shape @ np.swapaxes(A, -1, -2) + Q)
+        d = ahead - model.dynamics.value(self.opponent.centre, u)
+        w = np.where(np.einsum("bi,bij,bj->b", d, M, direction)[:, None] < 0, -direction, direction)
+        for _ in range(ASCENTS):
+            w = _to_boundary(np.einsum("bij,bj->bi", M, d + w) @ Q, Q, w)
+        return w
+
+    def _hide(self, clean: Array, direction: Array, u: Array) -> Array:
+        """Measurement noise on the boundary that leaves the filter the smallest innovation.
+
+        In the fused ellipsoid the state is at (a - delta)/(1 - delta), with a the weighed distances
+        before, which grows with the noise's own and falls with the innovation's, delta.
+        """
+        assert self.opponent is not None
+        model, R = self._truth.model, self._truth.measurement.shape
+        guess = model.dynamics.value(self.opponent.centre, u)
+        error = clean - model.measurement.value(guess, u)
+        return _to_boundary(-error, R, direction)
+
+
+def _to_boundary(vector: Array, shape: Array, otherwise: Array) -> Array:
+    """Vectors (lanes, n) stretched to the boundary of Omega(0, shape); those of no length aren't."""
+    length = np.sqrt(quadratic(vector, shape))
+    with np.errstate(all="ignore"):
+        stretched = vector / length[:, np.newaxis] * (1.0 - 1e-12)
+    sound = np.isfinite(stretched).all(axis=1)
+    return np.where(sound[:, np.newaxis], stretched, otherwise)
