@@ -60,6 +60,11 @@ class Analysis(NamedTuple):
     # What it wants run before, as the scenario's settings (KEY.PATH=VALUE); None: no run.
     wants_run: Callable[[Experiment], tuple[str, ...]] | None = None
 
+    @property
+    def key(self) -> str:
+        """What its settings stand under in a scenario, where names have no hyphens."""
+        return self.name.replace("-", "_")
+
 
 @functools.cache
 def analyses() -> Mapping[str, Analysis]:

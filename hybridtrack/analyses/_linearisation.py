@@ -129,10 +129,11 @@ def _printed(function: Nonlinear, x: Array) -> Function:
     bends = function.hessian(x)  # (m, k, d, d)
     m, k, d = bends.shape[:3]
     if d == 1:
+        sizes = np.abs(bends[:, np.newaxis, :, 0, 0]) * function.weights
 
         def of_one(c: Array) -> Array:
             away = x[:, np.newaxis, :] - c[np.newaxis, :, :]
-            result: Array = away**2 * np.abs(bends[:, np.newaxis, :, 0, 0]) * function.weights
+            result: Array = away * away * sizes
             return result
 
         return of_one

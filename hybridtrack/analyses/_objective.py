@@ -68,8 +68,9 @@ class Objective:
         the objective would be a staircase that solvers get stuck on.
         """
         owner = found.argmin(axis=1)
-        result = np.zeros(found.shape[1])
-        np.maximum.at(result, owner, found[np.arange(len(found)), owner])
+        own = found.min(axis=1)
+        models = range(found.shape[1])
+        result = np.array([own.max(where=owner == i, initial=0.0) for i in models])
         if not self.ordered:
             return result
         left = np.flatnonzero(owner[:-1] != owner[1:])

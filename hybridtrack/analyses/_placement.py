@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridtrack.analyses._enclosures import NotEnclosed, largest_size
+from hybridtrack.analyses._enclosures import largest_size
 from hybridtrack.analyses._linearisation import EXACT, Nonlinear, errors, lattice, of_bank
 from hybridtrack.models import Array
 
@@ -112,12 +112,12 @@ def _bends(function: Nonlinear, edges: Array) -> tuple[Array, bool]:
     coarse = np.linspace(edges[0], edges[-1], ENCLOSED + 1)
     if not function.expressions:
         return np.zeros((cells, len(function.components))), False
-    found = []
-    try:
-        for expression, weight in zip(function.expressions, function.weights, strict=True):
-            fourth = sympy.diff(expression, function.symbols[0], 4)
-            found.append(weight * largest_size(fourth, function.symbols[0], coarse))
-    except NotEnclosed:
+    (symbol,) = function.symbols
+    found = [
+        weight * largest_size(sympy.diff(expression, symbol, 4), symbol, coarse)
+        for expression, weight in zip(function.expressions, function.weights, strict=True)
+    ]
+    if not np.isfinite(found).all():
         return np.zeros((cells, len(function.components))), False
     # a cell may lie across an edge of the coarse ones by rounding: the larger of neighbours
     wide = np.stack([np.pad(one, 1, mode="edge") for one in found], axis=1)

@@ -22,6 +22,7 @@ from hybridtrack.analyses._procedure import Procedure, Range, Step, System
 from hybridtrack.analyses._steady_ellipsoids import NAMES, Steady
 from hybridtrack.description import Experiment
 from hybridtrack.errors import UserError
+from hybridtrack.expressions import number
 from hybridtrack.models import Array
 
 MOST_STATES = 3  # that points are placed in
@@ -62,9 +63,31 @@ def _analyse(experiment: Experiment, settings: Settings, measured: Measured | No
 
 def system_of(experiment: Experiment) -> System:
     """The scenario's nonlinear model, as expressions. Raises UserError where it has none."""
-    raise UserError(
-        f"{experiment.name}: its models are linear, and have no operating points; give it "
-        "'dynamics', as switched_esmf has"
+    model = experiment.nonlinear
+    if model is None:
+        raise UserError(
+            f"{experiment.name}: its models are linear, and have no operating points; give it "
+            "'dynamics', as switched_esmf has"
+        )
+    dynamics, measurement = model.dynamics, model.measurement
+    inputs: dict[Any, Any] = {}
+    names = experiment.resolved.get("inputs", {})
+    for i, (name, values) in enumerate(zip(names, model.inputs.T, strict=True)):
+        for map_ in (dynamics, measurement):
+            if np.ptp(values) and any(one.has(map_.inputs[i]) for one in map_.gradient):
+                raise UserError(
+                    f"{experiment.name}: the input {name} changes over time and the linear models "
+                    "with it, so that nothing is steady; give it one number"
+                )
+            inputs[map_.inputs[i]] = number(float(values[0]))
+    return System(
+        state_names=model.state_names,
+        measurement_names=model.measurement_names,
+        symbols=dynamics.states,
+        dynamics=tuple(one.subs(inputs) for one in dynamics.expressions),
+        measurement=tuple(one.subs(inputs) for one in measurement.expressions),
+        process_noise=model.process_noise_shape,
+        measurement_noise=model.measurement_noise_shape,
     )
 
 

@@ -15,7 +15,7 @@ from hybridtrack.statistics import METRICS
 from hybridtrack.verdicts import AnalysisClaim, Claim, printed_tolerance
 
 
-def analysis_claim(i: int, form: ScenarioForm, document: Document) -> AnalysisClaim:
+def analysis_claim(i: int, form: AnyForm, document: Document) -> AnalysisClaim:
     """The i-th claim, on a figure of an analysis."""
     claim = form.published[i]
     path: Keys = ("published", i)
