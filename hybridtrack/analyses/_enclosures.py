@@ -1,5 +1,6 @@
 """Bounds of a derivative over intervals that hold for certain, by python-flint's balls."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ def largest_size(expression: Any, symbol: Any, edges: Array) -> Array:
 
     function = sympy.lambdify([symbol], expression, modules=[ball_functions()])
     result = np.full(len(edges) - 1, np.inf)
-    for i, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for i, (low, high) in enumerate(itertools.pairwise(edges)):
         try:
             found = arb(function(arb(float(low)).union(arb(float(high)))))
         except (ZeroDivisionError, ValueError):

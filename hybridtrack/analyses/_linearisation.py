@@ -1,7 +1,7 @@
-"""How far a function is from its linear models over a range of states: eqs. 31 and 40 of Otanez 2004.
+"""How far a function is from its linear models over a range: eqs. 31 and 40 of Otanez 2004.
 
-Shapes: m places x, n points c that models are linearised at, d varied states, k components. SymPy is
-imported where a function is built, which only scenarios with expressions need.
+Shapes: m places x, n points c that models are linearised at, d varied states, k components. SymPy
+is imported where a function is built, which only scenarios with expressions need.
 """
 
 from collections.abc import Callable, Sequence
@@ -85,7 +85,9 @@ def from_expressions(
     )
 
 
-def compiled(expressions: Sequence[Any], symbols: Sequence[Any], shape: tuple[int, ...]) -> Function:
+def compiled(
+    expressions: Sequence[Any], symbols: Sequence[Any], shape: tuple[int, ...]
+) -> Function:
     """SymPy expressions as one function of places (m, d) that gives (m, *shape)."""
     import sympy
 
@@ -179,7 +181,7 @@ def worst_of(found: Array) -> float:
 
 
 def radii(function: Nonlinear, kind: str, x: Array, c: Array) -> Array:
-    """The largest error (k,) of each component, unweighted, by the models that `of_bank` chooses."""
+    """The largest error (k,) of each component, unweighted, by the models of `of_bank`."""
     found = errors(function, kind, x, c)
     best = found.max(axis=-1).argmin(axis=-1)
     own = found[np.arange(len(x)), best]
@@ -199,7 +201,7 @@ def largest_curvature(function: Nonlinear, x: Array) -> float:
 def lattice(low: Array, high: Array, most: int) -> Array:
     """Evenly spaced places (m, d) of a box, its corners among them, about as many as asked for."""
     d = len(low)
-    per_axis = max(int(round(most ** (1.0 / d))), 3)
+    per_axis = max(round(most ** (1.0 / d)), 3)
     axes = [np.linspace(a, b, per_axis) for a, b in zip(low, high, strict=True)]
     grid = np.meshgrid(*axes, indexing="ij")
     result: Array = np.stack([part.ravel() for part in grid], axis=-1)

@@ -42,8 +42,10 @@ def local_starts(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a solver's steps out of bounds, which it clips
             for i, start in enumerate(begun):
-                end = solver(objective, start.ravel()).reshape(objective.shape)
-                ends[i] = np.clip(end, low, high)
+                end = np.clip(solver(objective, start.ravel()).reshape(objective.shape), low, high)
+                # a solver that gave up below where it began hasn't gone anywhere
+                failed = not objective.worst(end.ravel()) <= objective.worst(start.ravel())
+                ends[i] = start if failed else end
         worst = np.array([objective.worst(end.ravel()) for end in ends])
         found.append(LocalStarts(name, ends, worst))
     return found

@@ -5,6 +5,7 @@ worst, and many local minima. In one state meetings of regions are interpolated 
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -36,11 +37,13 @@ class Objective:
             places = lattice(low, high, PLACES if self.ordered else PLACES_OF_SEVERAL)
         self._errors = on_places(function, kind, places)
         self._nudge = NUDGE * (high - low)
-        self.box = list(zip(np.tile(low, count).tolist(), np.tile(high, count).tolist(), strict=True))
+        self.box = list(
+            zip(np.tile(low, count).tolist(), np.tile(high, count).tolist(), strict=True)
+        )
 
     def by_region(self, points: Array) -> Array:
         """The largest error (n,) in the region that each model is the best in; 0 if it has none."""
-        return self._regions(self._errors(points.reshape(self.shape)).max(axis=-1))
+        return self._regions(self._largest(points.reshape(self.shape)))
 
     def worst(self, points: Array) -> float:
         """The largest of these."""
@@ -51,7 +54,7 @@ class Objective:
         count, d = self.shape
         at = points.reshape(self.shape)
         moved = at[:, np.newaxis] + np.diag(self._nudge)  # (n, d, d): one coordinate each
-        found = self._errors(np.vstack([at, moved.reshape(-1, d)])).max(axis=-1)
+        found = self._largest(np.vstack([at, moved.reshape(-1, d)]))
         still = found[:, :count]
         before = self._regions(still)
         result = np.empty((count, count * d))
@@ -61,6 +64,15 @@ class Objective:
             result[:, k] = (self._regions(tried) - before) / self._nudge[k % d]
         return result, before
 
+    def _largest(self, at: Array) -> Array:
+        """The errors (m, n) of points (n, d), of whichever component is the worst."""
+        found = self._errors(at)
+        # over an axis so short, one comparison after the other is three times as fast as max
+        result: Array = found[:, :, 0]
+        for j in range(1, found.shape[2]):
+            result = np.maximum(result, found[:, :, j])
+        return result
+
     def _regions(self, found: Array) -> Array:
         """Of errors (m, n): each model's largest, with those where two regions meet.
 
@@ -68,7 +80,7 @@ class Objective:
         the objective would be a staircase that solvers get stuck on.
         """
         owner = found.argmin(axis=1)
-        own = found.min(axis=1)
+        own = found[np.arange(len(found)), owner]
         models = range(found.shape[1])
         result = np.array([own.max(where=owner == i, initial=0.0) for i in models])
         if not self.ordered:
@@ -142,12 +154,14 @@ def nelder_mead(objective: Objective, start: Array) -> Array:
     level = objective.worst(start) or 1.0
     options = {"xatol": 1e-4, "fatol": 1e-4 * level}
     return _end(
-        minimize(objective.worst, start, method="Nelder-Mead", bounds=objective.box, options=options)
+        minimize(
+            objective.worst, start, method="Nelder-Mead", bounds=objective.box, options=options
+        )
     )
 
 
-def _end(answer: object) -> Array:
-    return np.asarray(answer.x, dtype=float)  # type: ignore[attr-defined]
+def _end(answer: Any) -> Array:
+    return np.asarray(answer.x, dtype=np.float64)
 
 
 SOLVERS: Mapping[str, Callable[[Objective, Array], Array]] = {

@@ -1,34 +1,43 @@
 """The analysis of operating points in words: its table, its conclusions, what is wrong in print."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hybridtrack.analyses._linearisation import PRINTED
-
-if TYPE_CHECKING:
-    from hybridtrack.analyses.operating_points import Said
+from hybridtrack.analyses._operating_design import TEN, Design
 
 Row = Mapping[str, Any]
 
 MOST_SHOWN = 5  # points that a terminal has room for
 
 
-def shown(said: "Said", rows: Sequence[Row]) -> dict[str, list[str]]:
+def shown(design: Design, rows: Sequence[Row]) -> dict[str, list[str]]:
     """What a terminal shows: a line for each placement."""
-    name = said.state_name
-    states = said.procedure.function.states
+    name = design.state_name
+    states = design.procedure.function.states
     cells = {
-        "placed": [row["placement"] for row in rows],
-        "points": [str(row["points"]) for row in rows],
+        "points": [_named(row) for row in rows],
         "worst\nerror": [_short(row["worst_error"]) if row["points"] else "" for row in rows],
         "norm-\nalised": [_short(row["normalised_error"]) if row["points"] else "" for row in rows],
     }
     if len(states) == 1:
         cells[f"at {states[0]} ="] = [_places(row, states[0]) for row in rows]
     cells[f"bound\n{name}"] = [_short(row[f"bound_{name}"]) or "none" for row in rows]
-    if said.wanted:
-        cells["with-\nin"] = ["yes" if row["meets_wanted"] else "no" for row in rows]
+    if design.wanted:
+        cells["with-\nin"] = [_answer(row) for row in rows]
     return cells
+
+
+def _named(row: Row) -> str:
+    if not row["points"]:
+        return "noise alone"
+    optimal = row["placement"] == "optimal"
+    return str(row["points"]) if optimal else f"{row['points']}: {row['placement']}"
+
+
+def _answer(row: Row) -> str:
+    return ("yes" if row["meets_wanted"] else "no") if row["points"] else ""
 
 
 def _places(row: Row, state: str) -> str:
@@ -41,6 +50,11 @@ def _short(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
+def _percent(part: float) -> str:
+    """A small part, rounded up to a power of ten."""
+    return f"{10.0 ** math.ceil(math.log10(max(100.0 * part, 1e-7))):g} %"
+
+
 def _count(points: int) -> str:
     return f"{points} point{'s' * (points != 1)}"
 
@@ -48,47 +62,47 @@ def _count(points: int) -> str:
 # ---- conclusions -----------------------------------------------------------------------------
 
 
-def conclusions(said: "Said", rows: Sequence[Row]) -> list[str]:
+def conclusions(design: Design, rows: Sequence[Row]) -> list[str]:
     """What a practitioner should conclude, in whole sentences."""
-    return [*_how_many(said, rows), *_how_far(said), *_others(said), *_local(said)]
+    return [*_how_many(design, rows), *_how_far(design), *_others(design), *_local(design)]
 
 
-def _how_many(said: "Said", rows: Sequence[Row]) -> list[str]:
-    name = said.state_name
+def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
+    name = design.state_name
     alone = rows[0][f"bound_{name}"]
     leave = f"noise alone leaves {alone:.3f}"
     bounds = {row["points"]: row[f"bound_{name}"] for row in rows if row["placement"] == "optimal"}
     most = max(bounds)
-    if not said.wanted:
+    if not design.wanted:
         listed = ", ".join(
             f"{bound:.3f} with {count}" for count, bound in bounds.items() if bound is not None
         )
         return [f"The bound on {name} settles at {listed or 'no value'} points; {leave}."]
     wanted = " and ".join(
-        f"{said.procedure.system.state_names[j]} within {bound:g}"
-        for j, bound in said.wanted.items()
+        f"{design.procedure.system.state_names[j]} within {bound:g}"
+        for j, bound in design.wanted.items()
     )
-    if said.needed is None:
+    if design.needed is None:
         last = bounds[most]
         settles = "has no steady state" if last is None else f"settles at {last:.3f}"
         return [
             f"Even {_count(most)} don't keep {wanted}: with them the bound on {name} {settles}; "
             f"{leave}."
         ]
-    verb = "is" if said.needed == 1 else "are"
+    verb = "is" if design.needed == 1 else "are"
     said_first = (
-        f"{_count(said.needed).capitalize()} {verb} enough for {wanted}: the bound on {name} "
-        f"settles at {bounds[said.needed]:.3f}; {leave}."
+        f"{_count(design.needed).capitalize()} {verb} enough for {wanted}: the bound on {name} "
+        f"settles at {bounds[design.needed]:.3f}; {leave}."
     )
-    fewer = bounds.get(said.needed - 1)
-    if said.needed > 1:
+    fewer = bounds.get(design.needed - 1)
+    if design.needed > 1:
         was = "has none" if fewer is None else f"is {fewer:.3f}"
         said_first = said_first[:-1] + f", and with one point fewer it {was}."
     return [said_first]
 
 
-def _how_far(said: "Said") -> list[str]:
-    steps = said.steps
+def _how_far(design: Design) -> list[str]:
+    steps = design.steps
     first, last = steps[0].placement, steps[-1].placement
     sentence = f"The worst linearisation error is {first.worst_error:.4g} with one point"
     if len(steps) > 1:
@@ -99,33 +113,36 @@ def _how_far(said: "Said") -> list[str]:
             for step in steps
             if step.placement.worst_error > 0.0
         )
-        return [f"{sentence}; no other places are better by more than {max(gap, 1e-9):.0e} of it."]
+        return [f"{sentence}; no other places are better by {_percent(gap)} of it."]
     doubt = next(step.placement.doubt for step in reversed(steps) if step.placement.doubt)
     return [f"{sentence}; that no other places are better is not certified ({doubt})."]
 
 
-def _others(said: "Said") -> list[str]:
+def _others(design: Design) -> list[str]:
     parts = []
-    for step in said.given:
+    for step in design.given:
         count = len(step.placement.points)
-        if count <= len(said.steps):
-            best = said.steps[count - 1].placement.worst_error
+        if count <= len(design.steps):
+            best = design.steps[count - 1].placement.worst_error
             more = 100.0 * (step.placement.worst_error / best - 1.0)
             parts.append(f"'{step.name}' by {more:.0f} %")
     if not parts:
         return []
-    return [f"The worst error of other placements is above the best of as many: {', '.join(parts)}."]
+    return [
+        f"The worst error of other placements is above the best of as many: {', '.join(parts)}."
+    ]
 
 
-def _local(said: "Said") -> list[str]:
-    if not said.study:
+def _local(design: Design) -> list[str]:
+    if not design.study:
         return []
-    optimum = said.steps[said.settings.starts_points - 1].placement.worst_error
+    optimum = design.studied
     shares = ", ".join(
-        f"{100 * one.share_within(10.0, optimum):.0f} % of {one.solver}" for one in said.study
+        f"{100 * one.share_within(TEN, optimum):.0f} % by {one.solver}" for one in design.study
     )
     return [
-        f"Of {said.settings.starts:,} random starts with {_count(said.settings.starts_points)}, "
+        f"Of {design.settings.starts:,} random starts, "
+        f"with {_count(design.settings.starts_points)}, "
         f"within 10 % of the optimum end {shares}: the solver decides."
     ]
 
@@ -133,25 +150,25 @@ def _local(said: "Said") -> list[str]:
 # ---- notes -----------------------------------------------------------------------------------
 
 
-def notes(said: "Said") -> list[str]:
+def notes(design: Design) -> list[str]:
     """What the paper prints wrongly or leaves open, and what was assumed."""
     said_first = (
         "errors as (40) prints them: the curvature at the state and no half, where (31) has it at "
         "the point; neither is a bound at every place, `remainder: exact` is"
-        if said.settings.remainder == PRINTED
+        if design.settings.remainder == PRINTED
         else "errors are |f(x) - f(c) - f'(c) (x - c)|; (40) of the paper is no bound of them"
     )
     found = [
         said_first,
         "normalised: by the largest curvature in the range (T v1 in the paper, which gives .129 so "
         "and .006 as it is)",
-        "one model serves all components at a place; (32) lets each take its own, which no bank can",
-        "a bank's bound is its widest model's, with the worst error of each component everywhere; a "
-        "box of m components takes m r^2, where (22) prints 2",
-        f"beta and rho by {said.settings.rule}; the paper names no rule, and what is steady depends "
-        "on it (rules.parquet)",
+        "one model serves all components at a place; (32) lets each take its own, as no bank can",
+        "a bank's bound is its widest model's, with the worst error of each component everywhere; "
+        "a box of m components takes m r^2, where (22) prints 2",
+        f"beta and rho by {design.settings.rule}; the paper names no rule, and what is steady "
+        "depends on it (rules.parquet)",
     ]
-    if len(said.procedure.function.components) > 1 and not said.settings.weights:
-        listed = ", ".join(said.procedure.function.components)
+    if len(design.procedure.function.components) > 1 and not design.settings.weights:
+        listed = ", ".join(design.procedure.function.components)
         found.append(f"errors of {listed} are compared as they stand; see 'weights'")
     return found

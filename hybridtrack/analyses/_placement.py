@@ -7,6 +7,7 @@ greedy piercing of intervals). So a bisection on the level finds the optimum of 
 2004, which local solvers miss from most starts.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -133,7 +134,7 @@ def _place_printed(
     edges = np.linspace(low, high, CELLS + 1)
     lower, upper, certain = weights_of_cells(function, edges)
     highest = float(upper.max()) * (high - low) ** 2
-    _, level, points = smallest_level(lambda q: pierce(edges, upper, q, count), highest)
+    _, _, points = smallest_level(lambda q: pierce(edges, upper, q, count), highest)
     below, _, _ = smallest_level(lambda q: pierce(edges, lower, q, count), highest)
     chosen = _filled(points, count)
     worst = worst_of_one(function, kind, low, high, chosen)
@@ -158,9 +159,7 @@ class Majorant(NamedTuple):
 
     def integrals(self, x: float) -> tuple[Array, Array]:
         """Of |f''| and of s |f''| from the left end to x: (k,) each."""
-        places = np.array([[x]])
-        value, slope = self.function.value(places)[0], self.function.jacobian(places)[0, :, 0]
-        zeroth, first = np.empty(len(value)), np.empty(len(value))
+        zeroth, first = np.empty((2, len(self.starts)))
         for j, (starts, signs) in enumerate(zip(self.starts, self.signs, strict=True)):
             past = starts < x
             ends = np.append(starts[1:], np.inf)
@@ -180,6 +179,10 @@ class Majorant(NamedTuple):
         (zeroth_x, first_x), (zeroth_c, first_c) = self.integrals(x), self.integrals(c)
         found = np.abs((first_c - first_x) - x * (zeroth_c - zeroth_x))
         return float((found * self.function.weights).max())
+
+    def error_of(self, c: float, x: float) -> float:
+        """E(x, c) of one point."""
+        return self.error(x, c)
 
 
 def majorant(function: Nonlinear, low: float, high: float) -> Majorant:
@@ -211,9 +214,9 @@ def _walk(bound: Majorant, low: float, high: float, level: float, count: int) ->
     served = low
     while len(points) < count:
         begin = served
-        point = _farthest(lambda c, x=begin: bound.error(x, c), begin, high, level)
+        point = _farthest(functools.partial(bound.error, begin), begin, high, level)
         points.append(point)
-        served = _farthest(lambda x, c=point: bound.error(x, c), point, high, level)
+        served = _farthest(functools.partial(bound.error_of, point), point, high, level)
         if served >= high:
             return points
     return None
@@ -235,7 +238,9 @@ def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Pl
     chosen = _filled(points, count)
     worst = worst_of_one(function, EXACT, low, high, chosen)
     changing = [
-        name for name, starts in zip(function.components, bound.starts, strict=True) if len(starts) > 1
+        name
+        for name, starts in zip(function.components, bound.starts, strict=True)
+        if len(starts) > 1
     ]
     if changing:
         doubt = (
@@ -253,8 +258,8 @@ def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Pl
 def _unseen(function: Nonlinear, low: float, high: float) -> float:
     """How far E may be above the error by changes of sign between two places that were looked at.
 
-    There f'' is no farther beyond 0 than max |f''''| h^2/8, or than what was taken for rounding, and
-    E exceeds the error by twice its integral over at most the range.
+    There f'' is no farther beyond 0 than max |f''''| h^2/8, or than what was taken for rounding,
+    and E exceeds the error by twice its integral over at most the range.
     """
     edges = np.linspace(low, high, SIGNS + 1)
     bend, certain = _bends(function, edges)
@@ -273,9 +278,7 @@ def _filled(points: list[float], count: int) -> Array:
     return np.array(points + points[-1:] * (count - len(points)))[:, np.newaxis]
 
 
-def worst_of_one(
-    function: Nonlinear, kind: str, low: float, high: float, points: Array
-) -> float:
+def worst_of_one(function: Nonlinear, kind: str, low: float, high: float, points: Array) -> float:
     """The largest error over the range, of a fine lattice with what lies between its best cells."""
     from scipy.optimize import minimize_scalar
 

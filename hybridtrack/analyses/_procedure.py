@@ -1,8 +1,8 @@
 """How many linear models a wanted bound needs, and where: steps 1 to 5 of Otanez 2004, III-B.
 
-1: the steady ellipsoid that the noises alone leave, which no number of models makes smaller. 2 to 5:
-a point more, the best places of them all, the steady ellipsoid with their worst remainder, until it
-is within what is wanted. Here a bank's bound is that of its widest model, since any may be chosen.
+1: the steady ellipsoid that the noises alone leave, which no number of models makes smaller. 2 to
+5: a point more, the best places of them all, the steady ellipsoid with their worst remainder, until
+it is within what is wanted. Here a bank's bound is its widest model's, since any may be chosen.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hybridtrack.analyses._enclosures import largest_size
 from hybridtrack.analyses._linearisation import (
     Nonlinear,
     compiled,
@@ -24,7 +25,8 @@ from hybridtrack.analyses._placement_several import place_several, worst_of_seve
 from hybridtrack.analyses._steady_ellipsoids import Steady, steady, with_box
 from hybridtrack.models import Array
 
-SAMPLED = 9  # places of the range whose linear models the smallest bound is the widest of
+NARROWED = 64  # cells that a pole is looked for in, and again in the first of them with one
+SAMPLED = 9  # places of the range that the smallest bound is looked for at
 
 
 class System(NamedTuple):
@@ -85,11 +87,7 @@ class Procedure:
         others: dict[Any, int] = {s: 0 for s in system.symbols if s not in own}
         n_x, n_y = len(system.dynamics), len(system.measurement)
         slopes = [
-            [
-                sympy.diff(e, s).subs(others)
-                for e in expressions
-                for s in system.symbols
-            ]
+            [sympy.diff(e, s).subs(others) for e in expressions for s in system.symbols]
             for expressions in (system.dynamics, system.measurement)
         ]
         self._dynamics = compiled(slopes[0], own, (n_x, n_x))
@@ -99,7 +97,9 @@ class Procedure:
     def place(self, over: Range, count: int) -> Placement:
         """Steps 2 and 3: the best `count` points."""
         if len(over.low) == 1:
-            return place_one(self.function, self.kind, float(over.low[0]), float(over.high[0]), count)
+            return place_one(
+                self.function, self.kind, float(over.low[0]), float(over.high[0]), count
+            )
         return place_several(self.function, self.kind, over.low, over.high, count, self.seed)
 
     def given(self, over: Range, points: Array) -> Placement:
@@ -133,6 +133,24 @@ class Procedure:
 
         points (n, d) that the models are linearised at; radius (k,) of the remainder, or none.
         """
+        found = [one for one in self._each(points, radius, rule, state) if one is not None]
+        if len(found) < len(points):
+            return None
+        return max(found, key=lambda one: float(one.half_widths[state]))
+
+    def smallest(self, over: Range, rule: str, state: int) -> Steady | None:
+        """Step 1: without remainder, linearised where in the range the bound is the smallest.
+
+        None where there is none anywhere.
+        """
+        places = lattice(over.low, over.high, SAMPLED)
+        found = [one for one in self._each(places, None, rule, state) if one is not None]
+        return min(found, key=lambda one: float(one.half_widths[state]), default=None)
+
+    def _each(
+        self, points: Array, radius: Array | None, rule: str, state: int
+    ) -> Iterator[Steady | None]:
+        """The steady ellipsoid of every model, kept for the next time."""
         system, n_x = self.system, len(self.system.state_names)
         whole = np.zeros(len(system.component_names))
         if radius is not None:
@@ -140,21 +158,11 @@ class Procedure:
             whole[places] = radius
         Q = with_box(system.process_noise, whole[:n_x])
         R = with_box(system.measurement_noise, whole[n_x:])
-        widest: Steady | None = None
         for A, C in zip(self._dynamics(points), self._measurement(points), strict=True):
             key = (A.tobytes(), C.tobytes(), Q.tobytes(), R.tobytes(), rule, state)
             if key not in self._known:
                 self._known[key] = steady(A, C, Q, R, rule, state)
-            found = self._known[key]
-            if found is None:
-                return None
-            if widest is None or found.half_widths[state] > widest.half_widths[state]:
-                widest = found
-        return widest
-
-    def smallest(self, over: Range, rule: str, state: int) -> Steady | None:
-        """Step 1: without remainder, wherever in the range the model is linearised."""
-        return self.bank(lattice(over.low, over.high, SAMPLED), None, rule, state)
+            yield self._known[key]
 
     def step(self, over: Range, name: str, placement: Placement, rule: str, state: int) -> Step:
         """Step 4: what a placement's worst remainder makes of the bound."""
@@ -164,7 +172,7 @@ class Procedure:
     def steps(
         self, over: Range, rule: str, wanted: Mapping[int, float], least: int, most: int
     ) -> Iterator[Step]:
-        """Steps 2 to 5: until the bounds wanted (by state) are met, and `least` points are tried."""
+        """Steps 2 to 5: until the bounds wanted, by state, are met and `least` points tried."""
         state = next(iter(wanted), 0)
         for count in range(1, most + 1):
             step = self.step(over, "optimal", self.place(over, count), rule, state)
@@ -189,15 +197,31 @@ class Procedure:
             self.function.hessian(x).reshape(len(x), -1),
         )
         sound = np.logical_and.reduce([np.isfinite(part).all(axis=1) for part in parts])
-        if sound.all():
-            return None
-        result: Array = x[int(np.argmin(sound))]
-        return result
+        if not sound.all():
+            result: Array = x[int(np.argmin(sound))]
+            return result
+        return self._pole(over) if len(over.low) == 1 else None
+
+    def _pole(self, over: Range) -> Array | None:
+        """A place (1,) that the lattice stepped over and a second derivative is not bounded at."""
+        import sympy
+
+        (symbol,) = self.function.symbols
+        for expression in self.function.expressions:
+            second = sympy.diff(expression, symbol, 2)
+            edges = np.linspace(over.low[0], over.high[0], NARROWED + 1)
+            for _ in range(2):  # a wide cell's enclosure may be infinite for width alone
+                unbounded = np.flatnonzero(~np.isfinite(largest_size(second, symbol, edges)))
+                if not unbounded.size:
+                    break
+                first = int(unbounded[0])
+                edges = np.linspace(edges[first], edges[first + 1], NARROWED + 1)
+            else:
+                return np.array([0.5 * (edges[0] + edges[-1])])
+        return None
 
 
-def profile(
-    procedure: Procedure, over: Range, points: Array, state: int
-) -> tuple[Array, Array]:
+def profile(procedure: Procedure, over: Range, points: Array, state: int) -> tuple[Array, Array]:
     """The bank's error along one state of the range, worst over the others: places and errors."""
     x = lattice(over.low, over.high, CHECKED // 20 if len(over.low) == 1 else CHECKED)
     found = of_bank(procedure.function, procedure.kind, x, points)

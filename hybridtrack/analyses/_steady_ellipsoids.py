@@ -15,6 +15,7 @@ from hybridtrack.models import Array
 
 STEPS = 20_000  # after which what still grows is said to grow for good
 SETTLED = 1e-10  # relative change per step
+DOUBLINGS = 40
 GROWN = 1e16  # times the start: it has no steady state
 NEAR = 1e-9  # of 0 and 1: a weight that leaves one of the two sets out
 
@@ -44,7 +45,7 @@ class Steady(NamedTuple):
 
 
 def beta_of_trace(moved: Array, noise: Array) -> float:
-    """Of the smallest trace of moved/(1 - beta) + noise/beta: sqrt(tr N)/(sqrt(tr M) + sqrt(tr N))."""
+    """Of the smallest trace of M/(1 - beta) + N/beta: sqrt(tr N)/(sqrt(tr M) + sqrt(tr N))."""
     one, two = math.sqrt(np.trace(moved)), math.sqrt(np.trace(noise))
     return two / (one + two) if two > 0.0 else 0.0
 
@@ -77,7 +78,9 @@ def beta_of_determinant(moved: Array, noise: Array) -> float:
 def rho_of_trace(P: Array, C: Array, R: Array) -> float:
     """Of the smallest trace of [(1 - rho) P^-1 + rho C' R^-1 C]^-1, which is convex in rho."""
     gains, parts = _seen(P, C, R)
-    return _root(lambda rho: float((parts * (1.0 - gains) / (1.0 + rho * (gains - 1.0)) ** 2).sum()))
+    return _root(
+        lambda rho: float((parts * (1.0 - gains) / (1.0 + rho * (gains - 1.0)) ** 2).sum())
+    )
 
 
 def rho_of_determinant(P: Array, C: Array, R: Array) -> float:
@@ -182,47 +185,56 @@ def intersection(P: Array, C: Array, R: Array, rho: float) -> Array:
     return result
 
 
-def with_constants(
-    A: Array, C: Array, Q: Array, R: Array, beta: float, rho: float
-) -> Array | None:
+def with_constants(A: Array, C: Array, Q: Array, R: Array, beta: float, rho: float) -> Array | None:
     """Sigma (n, n) for one beta and rho at all steps; None without one.
 
     P/(1 - rho) solves the Riccati equation of a Kalman filter with A/sqrt((1 - beta)(1 - rho)), the
     noises Q/(beta (1 - rho)) and R/rho.
     """
-    from scipy.linalg import solve_discrete_are
-
     grown = A / math.sqrt((1.0 - beta) * (1.0 - rho))
-    try:
-        wide = solve_discrete_are(grown.T, C.T, Q / (beta * (1.0 - rho)), R / rho)
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    if not np.isfinite(wide).all() or np.linalg.eigvalsh(wide)[0] < 0.0:
-        return None
-    return intersection((1.0 - rho) * wide, C, R, rho)
+    wide = _riccati(grown, C.T @ np.linalg.solve(R / rho, C), Q / (beta * (1.0 - rho)))
+    return None if wide is None else intersection((1.0 - rho) * wide, C, R, rho)
+
+
+def _riccati(A: Array, information: Array, Q: Array) -> Array | None:
+    """X = A X (I + G X)^-1 A' + Q by doubling: k rounds are 2^k steps of the recursion from X = Q.
+
+    Anderson 1978. scipy's solver takes milliseconds for what are 3 x 3 matrices, and this is
+    called a hundred times for every best constant.
+    """
+    F, G, X = A.T, information, Q
+    identity = np.eye(len(A))
+    for _ in range(DOUBLINGS):
+        half = np.linalg.solve(identity + G @ X, np.hstack([F, G]))
+        through, seen = half[:, : len(A)], half[:, len(A) :]
+        step = F.T @ X @ through
+        X, G = X + 0.5 * (step + step.T), G + F @ seen @ F.T
+        F = F @ through
+        if not np.isfinite(X).all() or np.trace(X) > GROWN * max(np.trace(Q), 1e-300):
+            return None
+        if np.abs(step).max() <= 1e-12 * np.abs(X).max():
+            return X
+    return None
 
 
 def best_constants(A: Array, C: Array, Q: Array, R: Array, state: int) -> Steady | None:
     """The constant beta and rho of the smallest Sigma_jj of a state: a search over both."""
-    import warnings
-
     from scipy.optimize import minimize
 
     def size(logits: Array) -> float:
         beta, rho = _weights(logits)
-        shape = with_constants(A, C, Q, R, beta, rho)
+        with np.errstate(all="ignore"):  # what grows for good
+            shape = with_constants(A, C, Q, R, beta, rho)
         return math.inf if shape is None else math.log(shape[state, state])
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of bad conditions where a weight is near its end
-        tried = [np.array([b, r]) for b in (-5.0, -3.0, -1.0) for r in (-5.0, -3.0, -1.0)]
-        start = min(tried, key=size)
-        if math.isinf(size(start)):
-            return None
-        options = {"xatol": 1e-4, "fatol": 1e-9}
-        answer = minimize(size, start, method="Nelder-Mead", options=options)
-        beta, rho = _weights(answer.x)
-        shape = with_constants(A, C, Q, R, beta, rho)
+    tried = [np.array([b, r]) for b in (-5.0, -3.0, -1.0) for r in (-5.0, -3.0, -1.0)]
+    start = min(tried, key=size)
+    if math.isinf(size(start)):
+        return None
+    simplex = start + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
+    options = {"xatol": 1e-4, "fatol": 1e-9, "initial_simplex": simplex}
+    beta, rho = _weights(minimize(size, start, method="Nelder-Mead", options=options).x)
+    shape = with_constants(A, C, Q, R, beta, rho)
     return None if shape is None else Steady(shape, beta, rho)
 
 

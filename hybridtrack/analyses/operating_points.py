@@ -7,54 +7,33 @@ that restarts find. Beside it, what local solvers make of the same problem.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from hybridtrack.analyses import Analysis, Findings, Measured, Table
-from hybridtrack.analyses import _operating_charts as charts
-from hybridtrack.analyses._local_starts import WITHIN_PERCENT, LocalStarts, local_starts
-from hybridtrack.analyses._objective import SOLVERS
+from hybridtrack.analyses import Analysis, Findings, Measured
+from hybridtrack.analyses._local_starts import LocalStarts, local_starts
+from hybridtrack.analyses._operating_charts import charts
+from hybridtrack.analyses._operating_design import OPTIMAL, TEN, WITHOUT, Design, Settings
+from hybridtrack.analyses._operating_tables import (
+    columns,
+    ends,
+    points,
+    row_of,
+    rules,
+    shares,
+    table_of,
+)
 from hybridtrack.analyses._operating_words import conclusions, notes, shown
-from hybridtrack.analyses._placement import Placement
-from hybridtrack.analyses._procedure import Procedure, Range, Step, System
-from hybridtrack.analyses._steady_ellipsoids import NAMES, Steady
+from hybridtrack.analyses._procedure import Procedure, Range, System
+from hybridtrack.analyses._steady_ellipsoids import Steady
 from hybridtrack.description import Experiment
 from hybridtrack.errors import UserError
 from hybridtrack.expressions import number
 from hybridtrack.models import Array
 
 MOST_STATES = 3  # that points are placed in
-WITHOUT, OPTIMAL = "without remainder", "optimal"
-HALF = 10.0  # per cent of the optimum that the paper counts starts within
-
-
-class Settings(NamedTuple):
-    """range: low and high by state; wanted: the largest half-width by state; both in its unit.
-
-    weights: of components of the dynamics (by state) or of the measurement ("measured NAME"), to
-    compare errors of unlike units. placements: points by a name, to be compared: a number each, or
-    a list where several states vary. least_points: how many are tried although fewer would do.
-    starts: of the local solvers (0: none), with starts_points points.
-    """
-
-    range: dict[str, list[float]] | None = None
-    wanted: dict[str, float] | None = None
-    remainder: Literal["exact", "printed_eq40"] = "exact"
-    rule: Literal[
-        "trace_trace",
-        "trace_sqrt",
-        "determinant_determinant",
-        "trace_determinant",
-        "best_constants",
-    ] = "trace_trace"
-    weights: dict[str, float] | None = None
-    placements: dict[str, list[float | list[float]]] | None = None
-    least_points: int = 3
-    most_points: int = 6
-    starts: int = 1000
-    starts_points: int = 3
 
 
 def _analyse(experiment: Experiment, settings: Settings, measured: Measured | None) -> Findings:
@@ -114,53 +93,34 @@ def findings(name: str, system: System, settings: Settings, seed: int) -> Findin
         study = local_starts(
             procedure.function, settings.remainder, *over, count, settings.starts, seed
         )
-    rows = [_row(procedure, over, WITHOUT, None, smallest, state)]
+    rows = [row_of(procedure, over, WITHOUT, None, smallest, state)]
     for step in (*steps, *given):
-        row = _row(procedure, over, step.name, step, step.steady, state)
+        row = row_of(procedure, over, step.name, step, step.steady, state)
         if wanted:
             row["meets_wanted"] = procedure.meets(step, settings.rule, wanted)
         if step.name == OPTIMAL and len(step.placement.points) == settings.starts_points:
             for one in study:
                 row[f"share_within_10_percent_{one.solver}"] = one.share_within(
-                    HALF, step.placement.worst_error
+                    TEN, step.placement.worst_error
                 )
         rows.append(row)
     for row in rows:
         row["points_needed"] = needed
     if wanted:
         rows[0]["meets_wanted"] = True
-    said = Said(procedure, over, wanted, state, steps, given, study, needed, settings)
+    design = Design(procedure, over, wanted, state, steps, given, study, needed, settings)
     return Findings(
-        table=_table(rows, _columns(procedure, said))._replace(shown=shown(said, rows)),
-        conclusions=conclusions(said, rows),
-        notes=notes(said),
+        table=table_of(rows, columns(procedure, design))._replace(shown=shown(design, rows)),
+        conclusions=conclusions(design, rows),
+        notes=notes(design),
         tables={
-            "rules": _rules(said, smallest),
-            "points": _points(said),
-            "local_starts": _ends(said),
-            "shares": _shares(said),
+            "rules": rules(design, smallest),
+            "points": points(design),
+            "local_starts": ends(design),
+            "shares": shares(design),
         },
-        charts=charts.charts(said),
+        charts=charts(design),
     )
-
-
-class Said(NamedTuple):
-    """All that tables, sentences and figures are made of."""
-
-    procedure: Procedure
-    over: Range
-    wanted: Mapping[int, float]  # by state
-    state: int  # whose bound is told
-    steps: Sequence[Step]  # with 1, 2, ... points
-    given: Sequence[Step]
-    study: Sequence[LocalStarts]
-    needed: int | None  # the fewest points that meet what is wanted
-    settings: Settings
-
-    @property
-    def state_name(self) -> str:
-        """The state whose bound is told."""
-        return self.procedure.system.state_names[self.state]
 
 
 # ---- what is asked, checked ------------------------------------------------------------------
@@ -183,7 +143,9 @@ def _range(name: str, procedure: Procedure, settings: Settings) -> Range:
     example = ", ".join(f"{state}: [low, high]" for state in states if state not in given)
     for state in given:
         if state not in procedure.system.state_names:
-            raise UserError(f"{name}: 'range' has '{state}', which is no state; {_those(procedure)}")
+            raise UserError(
+                f"{name}: 'range' has '{state}', which is no state; {_those(procedure)}"
+            )
         if state not in states:
             raise UserError(
                 f"{name}: 'range' has '{state}', along which a linear model leaves no remainder; "
@@ -264,8 +226,8 @@ def _smallest(
     if found is None:
         raise UserError(
             f"{name}: without any remainder the ellipsoid has no steady state by the rule {rule} "
-            "(a part of the state that doesn't decay is not seen in the measurements); choose "
-            "another rule or measurement"
+            "anywhere in the range (a part of the state that doesn't decay is not measured); "
+            "choose another rule or measurement"
         )
     for j, bound in wanted.items():
         own = procedure.smallest(over, rule, j)
@@ -298,128 +260,6 @@ def _placements(name: str, over: Range, settings: Settings) -> dict[str, Array]:
             )
         found[label] = array
     return found
-
-
-# ---- tables ----------------------------------------------------------------------------------
-
-
-def _row(
-    procedure: Procedure,
-    over: Range,
-    label: str,
-    step: Step | None,
-    settled: Steady | None,
-    state: int,
-) -> dict[str, Any]:
-    """A row of the main table; step None: without remainder."""
-    row: dict[str, Any] = {"placement": label, "points": 0}
-    names = procedure.system.state_names
-    if step is None:
-        row |= {"worst_error": 0.0, "normalised_error": 0.0}
-        banks = {rule: procedure.smallest(over, rule, state) for rule in NAMES}
-    else:
-        placement = step.placement
-        row |= _of_placement(procedure, over, placement)
-        banks = {
-            rule: procedure.bank(placement.points, step.radius, rule, state) for rule in NAMES
-        }
-    for j, name in enumerate(names):
-        row[f"bound_{name}"] = None if settled is None else float(settled.half_widths[j])
-    for rule, bank in banks.items():
-        row[f"bound_{names[state]}_{rule}"] = (
-            None if bank is None else float(bank.half_widths[state])
-        )
-    return row
-
-
-def _of_placement(procedure: Procedure, over: Range, placement: Placement) -> dict[str, Any]:
-    known = not math.isnan(placement.no_less_than)
-    row: dict[str, Any] = {
-        "points": len(placement.points),
-        "worst_error": placement.worst_error,
-        "normalised_error": procedure.normalised(over, placement.worst_error),
-        "no_less_than": placement.no_less_than if known else None,
-        "certificate": placement.certificate or None,
-        "doubt": placement.doubt or None,
-    }
-    for i, point in enumerate(placement.points):
-        for state, value in zip(procedure.function.states, point, strict=True):
-            row[f"{state}_{i + 1}"] = float(value)
-    return row
-
-
-def _columns(procedure: Procedure, said: Said) -> list[str]:
-    """The order of the main table's columns; each is there whether or not a row has it."""
-    names = procedure.system.state_names
-    most = max(len(step.placement.points) for step in (*said.steps, *said.given))
-    return [
-        *("placement", "points", "worst_error", "normalised_error", "no_less_than"),
-        *("certificate", "doubt"),
-        *(f"{state}_{i + 1}" for i in range(most) for state in procedure.function.states),
-        *(f"bound_{name}" for name in names),
-        *(f"bound_{names[said.state]}_{rule}" for rule in NAMES),
-        *("meets_wanted", "points_needed"),
-        *(f"share_within_10_percent_{solver}" for solver in SOLVERS),
-    ]
-
-
-def _table(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Table:
-    return Table({name: [row.get(name) for row in rows] for name in names})
-
-
-def _rules(said: Said, smallest: Steady) -> Table:
-    """Every rule's steady ellipsoid for every placement, of the widest model."""
-    procedure, rows = said.procedure, []
-    names = procedure.system.state_names
-    for rule in NAMES:
-        banks = [(WITHOUT, 0, procedure.smallest(said.over, rule, said.state))]
-        for step in (*said.steps, *said.given):
-            bank = procedure.bank(step.placement.points, step.radius, rule, said.state)
-            banks.append((step.name, len(step.placement.points), bank))
-        for label, count, bank in banks:
-            row = {"rule": rule, "placement": label, "points": count}
-            row |= {"beta": None, "rho": None} if bank is None else bank.weights
-            for j, name in enumerate(names):
-                row[f"bound_{name}"] = None if bank is None else float(bank.half_widths[j])
-            rows.append(row)
-    return _table(rows, list(rows[0]))
-
-
-def _points(said: Said) -> Table:
-    rows = []
-    for step in (*said.steps, *said.given):
-        for i, point in enumerate(step.placement.points):
-            row = {"placement": step.name, "points": len(step.placement.points), "point": i + 1}
-            states = said.procedure.function.states
-            rows.append(row | dict(zip(states, map(float, point), strict=True)))
-    return _table(rows, list(rows[0]))
-
-
-def _ends(said: Said) -> Table:
-    """Figure 2: where every solver ends from every start."""
-    scale = said.procedure.largest_curvature(said.over)
-    rows = [
-        {
-            "solver": one.solver,
-            "start": i + 1,
-            "worst_error": float(error),
-            "normalised_error": float(error) / scale,
-        }
-        for one in said.study
-        for i, error in enumerate(one.worst_errors)
-    ]
-    return _table(rows, ("solver", "start", "worst_error", "normalised_error"))
-
-
-def _shares(said: Said) -> Table:
-    """Figure 3: the share of starts within a percentage of the optimum."""
-    rows = []
-    for one in said.study:
-        optimum = said.steps[said.settings.starts_points - 1].placement.worst_error
-        for percent in WITHIN_PERCENT:
-            share = one.share_within(percent, optimum)
-            rows.append({"solver": one.solver, "within_percent": percent, "share_of_starts": share})
-    return _table(rows, ("solver", "within_percent", "share_of_starts"))
 
 
 ANALYSIS = Analysis(

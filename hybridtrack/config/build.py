@@ -20,7 +20,6 @@ from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case, FixedTruth
 from hybridtrack.verdicts import AnalysisClaim, Claim
 
-
 Claims = tuple[tuple[Claim, ...], tuple[AnalysisClaim, ...]]  # on runs, on analyses
 
 

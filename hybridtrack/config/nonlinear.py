@@ -44,7 +44,8 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
         )
     if len(times_s) > MOST_STEPS + 1:
         raise document.error(
-            ("clock",), f"there are {len(times_s) - 1:,} steps and may be {MOST_STEPS:,}; shorten it"
+            ("clock",),
+            f"there are {len(times_s) - 1:,} steps and may be {MOST_STEPS:,}; shorten it",
         )
     model = _model(form, len(times_s) - 1, document)
     truth = _truth(form, model, document)
@@ -97,7 +98,9 @@ def _model(form: NonlinearForm, n_steps: int, document: Document) -> NonlinearMo
         _known_state(name, states, document, ("dynamics", name))
     for name in states:
         if name not in form.dynamics:
-            raise document.error(("dynamics",), f"'dynamics' has no expression for '{name}'; add it")
+            raise document.error(
+                ("dynamics",), f"'dynamics' has no expression for '{name}'; add it"
+            )
     ordered = {name: form.dynamics[name] for name in states}
     dynamics = _map("dynamics", ordered, names, x, u, document)
     measurement = _map("measurement", form.measurement, names, x, u, document)
