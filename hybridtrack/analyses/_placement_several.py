@@ -15,7 +15,10 @@ from hybridtrack.analyses._placement import Placement
 from hybridtrack.models import Array
 
 PLACES = 600  # a lattice that candidates are judged on
-FINER = 2500  # that regions are told apart on
+FINER = 2500  # that answers are improved on
+POWERS = (4.0, 16.0, 64.0, 256.0)
+FARTHEST = 10.0  # times the best so far: what is worse counts as this, or powers overflow
+NUDGE = 1e-7  # of the box: a difference that slopes are taken over
 CHECKED = 40_000  # a finer one, for the worst error that is told
 ROUNDS = 8  # of adding the worst place that was missed
 SETTLED = 1e-3  # relative: what more rounds are not worth
@@ -86,7 +89,7 @@ def _polish(
     from scipy.optimize import minimize
 
     bounds = list(zip(np.tile(box[0], len(points)), np.tile(box[1], len(points)), strict=True))
-    points = _centred(function, kind, lattice(*box, FINER), box, points)
+    points = _smoothed(function, kind, lattice(*box, FINER), box, points)
     level, place = worst_of_several(function, kind, *box, points)
     best = (level, points)
     for _ in range(ROUNDS):
@@ -108,36 +111,50 @@ def _polish(
     return best
 
 
-def _centred(
+def _smoothed(
     function: Nonlinear, kind: str, places: Array, box: tuple[Array, Array], points: Array
 ) -> Array:
-    """Each point to the best place for its own region, region by region, while that helps.
+    """Downhill on power means of the errors, of ever higher powers, which tend to the largest.
 
-    A region has d unknowns where all together have n d; neither half of a round makes the worst
-    error larger (Lloyd 1982, with the largest error for the mean).
+    The largest itself has a kink at every good answer, where steps along one coordinate at a time
+    all go up; the means have slopes. Each power begins where the one before it ended.
     """
     from scipy.optimize import minimize
 
-    points = points.copy()
-    bounds = list(zip(*box, strict=True))
+    n, d = points.shape
+    nudge = NUDGE * (box[1] - box[0])
     judge = on_places(function, kind, places)
-    level = worst_of(judge(points))
-    for _ in range(ROUNDS):
-        owner = judge(points).max(axis=-1).argmin(axis=-1)
-        for i in np.unique(owner):
-            own = on_places(function, kind, places[owner == i])
-            answer = minimize(
-                lambda c, own=own: worst_of(own(c[np.newaxis])),
-                points[i],
-                method="Nelder-Mead",
-                bounds=bounds,
-                options={"xatol": 1e-5, "fatol": 1e-5 * level, "maxfev": 100 * len(bounds)},
-            )
-            points[i] = answer.x
-        before, level = level, worst_of(judge(points))
-        if level >= before * (1.0 - SETTLED):
-            break
-    return points
+    every = np.arange(len(places))
+
+    def mean(c: Array, power: float, scale: float) -> tuple[float, Array]:
+        at = c.reshape(n, d)
+        moved = (at[:, np.newaxis] + np.diag(nudge)).reshape(-1, d)
+        ratio = np.minimum(judge(np.vstack([at, moved])) / scale, FARTHEST)
+        found = (ratio**power).sum(axis=-1)
+        owner = found[:, :n].argmin(axis=1)
+        own = found[every, owner]
+        total = float(own.mean()) + 1e-300
+        rise = found[:, n:].reshape(-1, n, d)[every, owner] - own[:, np.newaxis]
+        slopes = np.zeros((n, d))
+        np.add.at(slopes, owner, rise / nudge)
+        level = total ** (1.0 / power)
+        return level, level / (power * total * len(places)) * slopes.ravel()
+
+    best = (worst_of(judge(points)), points)
+    for power in POWERS:
+        answer = minimize(
+            mean,
+            points.ravel(),
+            args=(power, best[0]),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=list(zip(np.tile(box[0], n), np.tile(box[1], n), strict=True)),
+        )
+        points = np.asarray(answer.x).reshape(n, d)
+        level = worst_of(judge(points))
+        if level < best[0]:
+            best = (level, points)
+    return best[1]
 
 
 def worst_of_several(
