@@ -332,7 +332,7 @@ class _Block:
                 )
 
     def _start_nonlinear(self, truth: BoundedTruth, stop: threading.Event) -> None:
-        """Filters of a nonlinear model, and the adversary's own copy of the one it plays against."""
+        """Filters of a nonlinear model, and the adversary's own copy of its opponent."""
         experiment, initial = self._experiment, self._experiment.initial
         model = experiment.nonlinear
         assert model is not None
@@ -522,9 +522,10 @@ class _Block:
     ) -> None:
         for e, name in enumerate(running.state_names):
             self._keep(span, label, name, estimates.mean[:, e])
-            self._keep(span, label, f"bound:{name}", np.sqrt(running.sets.shape[:, e, e]))
+            bound: Array = np.sqrt(running.sets.shape[:, e, e])
+            self._keep(span, label, f"bound:{name}", bound)
         if running.point_names:
-            self._keep(span, label, "model", running.sets.chosen + 1.0)
+            self._keep(span, label, "model", running.sets.chosen.astype(np.float64) + 1.0)
 
     def _keep(self, span: slice, label: str, quantity: str, values: Array) -> None:
         for run in range(self._task.tracks):

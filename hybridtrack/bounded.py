@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridtrack.ellipsoids import inverse, quadratic
 from hybridtrack.models import Array
@@ -55,7 +56,7 @@ class NoiseRuns:
         """generator: the purpose's own stream, read on from span to span."""
         self._noise, self._generator, self._runs = noise, generator, runs
         self._root = square_root(noise.shape)
-        self._signs = np.zeros((runs, len(noise.shape)))
+        self._signs: Array = np.zeros((runs, len(noise.shape)))
         self._step = 0
 
     def advance(self, steps: int) -> Array:
@@ -65,18 +66,22 @@ class NoiseRuns:
         kind = self._noise.kind
         if kind == "none":
             return np.zeros(shape)
+        unit: Array
         if kind.startswith("persistent"):
             unit = self._held_signs(steps)
-            unit = unit / np.sqrt(n) if kind == "persistent_ball" else unit
+            if kind == "persistent_ball":
+                unit /= np.sqrt(n)
         elif kind == "box":
             unit = self._generator.uniform(-1.0, 1.0, shape)
         elif kind in PRINTED:
             unit = printed(kind, self._generator, shape)
         else:
-            unit = self._generator.standard_normal(shape)
-            unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
-            if kind == "ball":
-                unit *= self._generator.random((*shape[:2], 1)) ** (1.0 / n)
+            # The first n components of a point on the sphere of n + 2 dimensions are uniform in the
+            # ball of n; one kind of draw from the stream doesn't depend on the length of spans.
+            more = 2 if kind == "ball" else 0
+            drawn = self._generator.standard_normal((*shape[:2], n + more))
+            length: Array = np.sqrt((drawn**2).sum(axis=-1, keepdims=True))
+            unit = drawn[..., :n] / length
         result: Array = unit @ self._root.T
         return result
 
@@ -84,7 +89,8 @@ class NoiseRuns:
         signs = np.empty((steps, *self._signs.shape))
         for k in range(steps):
             if self._step % self._noise.hold_steps == 0:
-                self._signs = 2.0 * self._generator.integers(0, 2, self._signs.shape) - 1.0
+                drawn = self._generator.integers(0, 2, self._signs.shape)
+                self._signs = (2 * drawn - 1).astype(np.float64)
             signs[k] = self._signs
             self._step += 1
         return signs
@@ -173,7 +179,7 @@ class BoundedRuns:
     def _push(self, ahead: Array, direction: Array, u: Array) -> Array:
         """Process noise on the boundary that drives the state out of the predicted ellipsoid.
 
-        It maximises (d + w)' M (d + w), d the error ahead of it and M the inverse of A Sigma A' + Q:
+        It maximises (d + w)' M (d + w), d the error ahead and M the inverse of A Sigma A' + Q:
         convex, so the boundary point in the direction of the slope is never worse.
         """
         assert self.opponent is not None
@@ -200,9 +206,9 @@ class BoundedRuns:
 
 
 def _to_boundary(vector: Array, shape: Array, otherwise: Array) -> Array:
-    """Vectors (lanes, n) stretched to the boundary of Omega(0, shape); those of no length aren't."""
+    """Vectors (lanes, n) stretched to the boundary of Omega(0, shape), if they have a length."""
     length = np.sqrt(quadratic(vector, shape))
     with np.errstate(all="ignore"):
         stretched = vector / length[:, np.newaxis] * (1.0 - 1e-12)
-    sound = np.isfinite(stretched).all(axis=1)
+    sound: NDArray[np.bool_] = np.asarray(np.isfinite(stretched).all(axis=1))
     return np.where(sound[:, np.newaxis], stretched, otherwise)

@@ -62,6 +62,15 @@ SCHEMAS = {
             ("standard_error", pa.float64()),
         ]
     ),
+    "sets": pa.schema(
+        [
+            ("estimator", pa.string()),
+            ("figure", pa.string()),
+            ("value", pa.float64()),
+            ("standard_error", pa.float64()),
+            ("n_runs", pa.int64()),
+        ]
+    ),
     "delays": pa.schema(
         [
             ("case", pa.string()),

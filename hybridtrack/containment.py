@@ -63,6 +63,17 @@ def set_metrics(states: tuple[str, ...], points: tuple[str, ...]) -> dict[str, M
     return FLAGS | of_states | of_points | NOISE
 
 
+def metrics_of(quantities: tuple[str, ...]) -> dict[str, Metric]:
+    """The metrics of sets that some quantities are of, by name."""
+    kinds = {kind: f"{kind}:" for kind in ("bound", FIRST_CHOICE)}
+    states, points = (
+        tuple(q.removeprefix(start) for q in quantities if q.startswith(start))
+        for start in kinds.values()
+    )
+    every = set_metrics(states, points).items()
+    return {name: metric for name, metric in every if metric.quantity in quantities}
+
+
 class Names(NamedTuple):
     """What is scored, by name."""
 
@@ -81,7 +92,8 @@ class SetTally:
         n_w, n_x, n_p = len(names.windows), len(names.states), len(names.points)
         self._met = np.zeros((n_w, runs), dtype=np.bool_)  # whether the window holds a step
         self._flags = {
-            name: np.zeros((n_w, runs), dtype=np.bool_) for name in ("violated", "emptied", "useless")
+            name: np.zeros((n_w, runs), dtype=np.bool_)
+            for name in ("violated", "emptied", "useless")
         }
         self._largest = np.zeros((n_w, runs))
         self._switches = np.zeros((n_w, runs))
@@ -91,8 +103,10 @@ class SetTally:
         self._last: NDArray[np.int64] | None = None
         self._steps: dict[str, list[Moments]] = {}
 
-    def add(self, span: slice, truth: Array, mean: Array, sets: Sets, held: NDArray[np.bool_]) -> None:
-        """Score a span: truth and mean (n_steps, n_x, lanes), held (n_steps, n_windows, lanes or 1).
+    def add(
+        self, span: slice, truth: Array, mean: Array, sets: Sets, held: NDArray[np.bool_]
+    ) -> None:
+        """Score a span: truth and mean (n_steps, n_x, lanes); held as blocks have it.
 
         A step whose estimate is NaN, of a run that has diverged, isn't counted.
         """
@@ -101,7 +115,7 @@ class SetTally:
         error = np.swapaxes(truth[..., :runs] - mean[..., :runs], 1, 2)
         distance = quadratic(error, shape)  # (n_steps, runs)
         bound = half_widths(shape)  # (n_steps, runs, n_x)
-        told = ~np.isnan(error).any(axis=2)
+        told: NDArray[np.bool_] = ~np.asarray(np.isnan(error).any(axis=2))
         empty, chosen = sets.empty[:, :runs], sets.chosen[:, :runs]
         outside = told & (~(distance <= 1.0 + TOLERANCE) | empty)
         useless = told & (bound[..., list(self._names.angles)] > USELESS).any(axis=2)
@@ -182,7 +196,7 @@ class NoiseTally:
         self._numbers = np.zeros((len(windows), runs))
 
     def add(self, outside: Array, held: NDArray[np.bool_]) -> None:
-        """Outside (n_steps, lanes, 2) is 1 where a draw is; held (n_steps, n_windows, lanes or 1)."""
+        """Outside (n_steps, lanes, 2) is 1 where a draw is; held as in SetTally."""
         far = outside[:, : self._runs]
         for w in range(len(self._windows)):
             inside = np.broadcast_to(held[:, w, : self._runs], far.shape[:2])

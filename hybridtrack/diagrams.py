@@ -54,6 +54,8 @@ def chains(experiment: Experiment) -> dict[str, Chain]:
     The scenario's own chain, which many estimators share, is there once, as `modes`. Raises
     UserError where there is none, or one is too large.
     """
+    if not experiment.bank.modes:
+        raise UserError(f"{experiment.name}: there are no modes here, and so no chain to draw")
     found: dict[str, Chain] = {}
     truth = experiment.cases[0].truth
     if isinstance(truth, ChainTruth):

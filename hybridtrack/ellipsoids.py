@@ -1,7 +1,7 @@
 """Ellipsoids that contain a state for certain: their sums, their intersections, boxes inside them.
 
-An ellipsoid Omega(c, S) is the set of x with (x - c)' S^-1 (x - c) <= 1. Shapes: lanes (runs) first,
-S (lanes, n, n), c (lanes, n). Everything is NumPy over all lanes at once.
+An ellipsoid Omega(c, S) is the set of x with (x - c)' S^-1 (x - c) <= 1. Shapes: lanes (runs)
+first, S (lanes, n, n), c (lanes, n). Everything is NumPy over all lanes at once.
 """
 
 from collections.abc import Callable
@@ -88,8 +88,7 @@ def update(
     """Fuse Omega(centre, shape) with a measurement (Otanez 2004, eq. 3-5), in Joseph's form.
 
     innovation e = y - h(centre) (lanes, n_y); C (n_y, n) or (lanes, n_y, n); R alike; rho (lanes,)
-    in (0, 1). (4) as printed cancels: a large P minus nearly itself. (I - K C) P (I - K C)' + K R K'
-    is a sum of two squares.
+    in (0, 1). (4) as printed cancels: a large P minus nearly itself; here two squares are added.
     """
     P = shape / (1.0 - rho)[:, np.newaxis, np.newaxis]
     noise = R / rho[:, np.newaxis, np.newaxis]
@@ -114,7 +113,7 @@ def inverse(shape: Array) -> Array:
             # b/a first: a d alone may leave the range of floats.
             result: Array = swapped / (a * (d - b * (b / a)))[..., np.newaxis, np.newaxis]
             return result
-        sound = np.isfinite(shape).all(axis=(-1, -2))
+        sound: NDArray[np.bool_] = np.asarray(np.isfinite(shape).all(axis=(-1, -2)))
         safe = np.where(sound[..., np.newaxis, np.newaxis], shape, np.eye(m))
         try:
             inverted: Array = np.linalg.inv(safe)
@@ -151,10 +150,12 @@ def sizes(shape: Array, measure: str) -> Array:
     """How large ellipsoids are (lanes,): trace, determinant or largest eigenvalue of S."""
     if measure == "trace":
         return trace(shape)
-    sound = np.isfinite(shape).all(axis=(-1, -2))
+    sound: NDArray[np.bool_] = np.asarray(np.isfinite(shape).all(axis=(-1, -2)))
     safe = np.where(sound[..., np.newaxis, np.newaxis], shape, np.eye(shape.shape[-1]))
     with np.errstate(all="ignore"):
-        found = np.linalg.det(safe) if measure == "determinant" else np.linalg.eigvalsh(safe)[..., -1]
+        found = (
+            np.linalg.det(safe) if measure == "determinant" else np.linalg.eigvalsh(safe)[..., -1]
+        )
     result: Array = np.where(sound, found, np.inf)
     return result
 

@@ -27,6 +27,7 @@ from hybridtrack.config import Experiment, dump
 from hybridtrack.delays import Delays
 from hybridtrack.detections import delay_rows
 from hybridtrack.executors import in_order
+from hybridtrack.guarantees import SetRuns
 from hybridtrack.results import RunFolder
 from hybridtrack.simulation import BLOCK_RUNS
 from hybridtrack.statistics import Moments, SumMoments, VectorMoments
@@ -113,13 +114,20 @@ def run(experiment: Experiment, path: Path, workers: int, report: Report) -> Non
             tracks += [(case, track) for track in kept]
         names = [shard.name for shard in shards]
         pairs = outcomes.pairs_wanted(experiment)
-        folder.assemble_runs(names, pairs.add)
+        sets = SetRuns(experiment)
+
+        def look(runs: Any) -> None:
+            pairs.add(runs)
+            sets.add(runs)
+
+        folder.assemble_runs(names, look)
         merged = [cases[c] for c in range(len(experiment.cases))]
         folder.write_table("steps", outcomes.steps_rows(experiment, merged))
         folder.write_table("tracks", outcomes.tracks_rows(experiment, tracks))
         folder.write_table("summary", outcomes.summary_rows(experiment, merged))
         folder.write_table("comparisons", outcomes.comparisons_rows(experiment, pairs))
         folder.write_table("reliability", outcomes.reliability_rows(experiment, merged))
+        folder.write_table("sets", sets.rows())
         delays = delay_rows(experiment, merged)
         folder.write_table("delays", delays.switches)
         folder.write_table("delay_distribution", delays.distribution)

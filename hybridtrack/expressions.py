@@ -197,7 +197,7 @@ class _Reader:
             raise ExpressionError(f"it calls what is no function's name; {_there_are()}")
         name = node.func.id
         if name not in FUNCTIONS:
-            close = difflib.get_close_matches(name, FUNCTIONS, 1, 0.7)
+            close = difflib.get_close_matches(name, FUNCTIONS, 1, 0.6)
             hint = f"did you mean '{close[0]}'?" if close else _there_are()
             raise ExpressionError(f"'{name}' is no function here; {hint}")
         wanted = 1 + (name in TWO_ARGUMENTS)

@@ -24,6 +24,7 @@ from hybridtrack.page import (
     save_one,
     style,
 )
+from hybridtrack.set_courses import draw_bounds, draw_models, draw_points
 from hybridtrack.trajectories import draw_trajectory
 
 __all__ = ["RunInformation", "draw", "save"]
@@ -44,8 +45,8 @@ def draw(
     Returns:
         Figures by name: trajectory (of the first run in `tracks`), position_error,
         velocity_error, error_ratio, mode_probability, mode_likelihood, final_mode_probability and
-        reliability. With several cases the figures over time are drawn for each of the first six,
-        and their names end in `-CASE`.
+        reliability; of sets bound, operating_points and model_chosen. With several cases the
+        figures over time are drawn for each of the first six, and their names end in `-CASE`.
     """
     with style():
         looks = _looks(steps, tracks, information)
@@ -59,6 +60,9 @@ def draw(
                 figures[metric + case.suffix] = draw_modes(case, metric, looks, information)
             name = "final_mode_probability"
             figures[name + case.suffix] = draw_final_mode(case, looks, information)
+            figures["bound" + case.suffix] = draw_bounds(case, looks, information)
+            figures["operating_points" + case.suffix] = draw_points(case, looks, information)
+            figures["model_chosen" + case.suffix] = draw_models(case, tracks, looks, information)
         if reliability is not None:
             figures["reliability"] = _draw_reliability(reliability, looks, information)
     return {name: figure for name, figure in figures.items() if figure is not None}

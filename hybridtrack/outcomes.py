@@ -11,6 +11,7 @@ import pyarrow as pa
 from hybridtrack import columns, results
 from hybridtrack.blocks import RAW, BlockResult, GroupStatistics, Track
 from hybridtrack.config import Experiment
+from hybridtrack.containment import metrics_of
 from hybridtrack.errors import UserError
 from hybridtrack.simulation import BLOCK_RUNS
 from hybridtrack.statistics import (
@@ -227,6 +228,7 @@ class Pairs:
         shape = (len(labels), len(windows), -1)
         names = [name for name in runs.column_names if name.endswith("_sum")]
         self._quantities = [name.removesuffix("_sum") for name in names]
+        self._metrics = {**self._metrics, **metrics_of(tuple(self._quantities))}
         sums, numbers = (
             np.stack(
                 [columns.as_numpy(runs[f"{q}_{kind}"]).reshape(shape) for q in self._quantities]

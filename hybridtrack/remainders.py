@@ -55,7 +55,7 @@ class Remainder(NamedTuple):
         return lower, upper
 
     def at_point(self, centre: Array, x: Array, u: Array) -> Array:
-        """|(x - c)' H(x) (x - c)| (lanes, n) at a single point, as Otanez 2004, eq. 40 prints it."""
+        """|(x - c)' H(x) (x - c)| (lanes, n) at a single point, as Otanez 2004, eq. 40."""
         d = x - centre
         curvature = self.map.hessian(x, u)
         result: Array = np.abs(np.einsum("be,bief,bf->bi", d, curvature, d))
@@ -71,8 +71,9 @@ def remainder(map_: Map) -> Remainder:
 def wave_range(centre: Array, low: Array, high: Array) -> Enclosed:
     """Least and most (lanes,) of g(t) = cos t - cos c + sin c (t - c) for t in [low, high].
 
-    g' = sin c - sin t is 0 at t = c + 2 pi k and at t = pi - c + 2 pi k. In each of the two series g
-    is linear in k, so the first and the last inside are all that can be extremal. Rounded outwards.
+    g' = sin c - sin t is 0 at t = c + 2 pi k and at t = pi - c + 2 pi k. In each of the two series
+    g is linear in k, so the first and the last inside are all that can be extremal. Rounded
+    outwards.
     """
     sine, cosine = np.sin(centre), np.cos(centre)
     places = [low, high]
@@ -137,7 +138,7 @@ class Balls:
             for e in range(n_x):
                 for f in range(n_x):
                     bend = bends[(i * n_x + e) * n_x + f]
-                    lagrange += bend * (step[e] ** 2 if e == f else step[e] * step[f])
+                    lagrange += bend * (square(step[e]) if e == f else step[e] * step[f])
             forms = [ends(mean_value), ends(lagrange / 2)]
             lower[i] = max(form[0] for form in forms)
             upper[i] = min(form[1] for form in forms)
@@ -154,19 +155,24 @@ class Balls:
             return [arb("0 +/- inf")] * count
 
 
+def square(ball: Any) -> Any:
+    """The range of a square, which a product of the ball with itself would take below 0."""
+    return (ball.abs_lower() ** 2).union(ball.abs_upper() ** 2)
+
+
 def ends(ball: Any) -> tuple[float, float]:
     """Floats at or beyond the ends of a ball; infinite where it has none."""
     if not ball.is_finite():
         return -np.inf, np.inf
     low, high = float(ball.lower()), float(ball.upper())
-    if not ball.lower() == low:
+    if ball.lower() != low:
         low = float(np.nextafter(low, -np.inf))
-    if not ball.upper() == high:
+    if ball.upper() != high:
         high = float(np.nextafter(high, np.inf))
     return low, high
 
 
-def ball_functions() -> dict[str, Callable[..., Any]]:
+def ball_functions() -> dict[str, Any]:
     """The functions of expressions on balls, by the names that SymPy's printer gives them."""
     from flint import arb
 
@@ -174,7 +180,6 @@ def ball_functions() -> dict[str, Callable[..., Any]]:
         return lambda value: getattr(arb(value), name)()
 
     plain = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log")
-    return {name: of(name) for name in (*plain, "sqrt")} | {
-        "atan2": lambda y, x: arb.atan2(arb(y), arb(x)),
-        "pi": arb.pi(),
-    }
+    words: dict[str, Any] = {name: of(name) for name in (*plain, "sqrt")}
+    words["atan2"] = lambda y, x: arb.atan2(arb(y), arb(x))
+    return words

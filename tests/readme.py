@@ -75,6 +75,8 @@ def generated(what: str, folders: dict[str, Path]) -> str:
         claimed = [folders[n] for n in config.shipped() if config.load(n).claims]
         claimed += [folder for words, folder in folders.items() if words.startswith("analyze ")]
         return "\n" + markdown(claimed) + "\n"
+    if what.startswith("sets of "):
+        return "\n" + sets(folders[what.removeprefix("sets of ")]) + "\n"
     if what == "ratios to the genie":
         return "\n" + ratios(folders, EXAMPLES, ("SBF", "HBF", "IMM", "KF_m2")) + "\n"
     if what == "ratios to the best sequences":
@@ -97,6 +99,23 @@ def generated(what: str, folders: dict[str, Path]) -> str:
     lines = [line.rstrip() for line in out.getvalue().splitlines()]
     lines += [f"figures: runs/{name}-DIGEST/figures", f"runs/{name}-DIGEST"]
     return "\n".join(["```text", f"$ {what}", *lines, "```", ""])
+
+
+def sets(folder: Path) -> str:
+    """What came of the sets of a run's estimators."""
+    rows = results.read_rows(folder, "sets")
+    found = {(row["estimator"], row["figure"]): row for row in rows}
+    bounds = [f for f in dict.fromkeys(row["figure"] for row in rows) if f.startswith("median")]
+    heads = [heading for _, heading in tables.OUTCOMES] + ["largest error"]
+    heads += [f"bound on {figure.partition(':')[2]}" for figure in bounds]
+    lines = [f"| | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
+    for label in dict.fromkeys(row["estimator"] for row in rows):
+        cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables.OUTCOMES]
+        cells.append(f"{found[label, 'largest_normalised_error']['value']:.3g}")
+        medians = [found[label, figure] for figure in bounds]
+        cells += [tables.figure(row["value"], row["standard_error"]) for row in medians]
+        lines.append(f"| `{label}` | {' | '.join(cells)} |")
+    return "\n".join([*lines, ""])
 
 
 def ratios(folders: dict[str, Path], scenarios: dict[str, str], labels: tuple[str, ...]) -> str:

@@ -1207,6 +1207,6 @@ def test_the_json_schema_knows_no_other_key(path: str) -> None:
 def test_the_json_schema_knows_the_names_and_the_metrics() -> None:
     schema = json.loads(json.dumps(json_schema()))
     assert "patternProperties" not in json.dumps(schema)  # would let every other name pass
-    names = schema["properties"]["estimators"]["propertyNames"]
+    names = schema["$defs"]["ScenarioForm"]["properties"]["estimators"]["propertyNames"]
     assert names == {"pattern": "^[A-Za-z0-9_-]+$", "maxLength": 64}
     assert "position_rmse_m" in schema["$defs"]["ClaimForm"]["properties"]["metric"]["enum"]

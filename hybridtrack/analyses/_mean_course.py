@@ -15,6 +15,7 @@ from hybridtrack.simulation import (
     BLOCK_RUNS,
     BlockSimulation,
     Case,
+    FixedTruth,
     sojourns,
     spans,
     step_lengths,
@@ -63,7 +64,7 @@ def courses(experiment: Experiment) -> Iterator[Course]:
 
 def _of_flight(case: Case, truth_modes: tuple[str, ...]) -> Course:
     truth = case.truth
-    assert not isinstance(truth, ChainTruth)
+    assert isinstance(truth, FixedTruth)
     lasting = sojourns(truth)
     assert lasting is not None
     last = np.cumsum(lasting)

@@ -7,9 +7,9 @@ from hybridtrack.compiled import PACKAGE
 from hybridtrack.config.build import build
 from hybridtrack.config.checks import nearest
 from hybridtrack.config.json_form import json_schema
-from hybridtrack.config.reader import Document, ScenarioError, read
 from hybridtrack.config.nonlinear import build_nonlinear
 from hybridtrack.config.nonlinear_form import NonlinearForm
+from hybridtrack.config.reader import Document, ScenarioError, read
 from hybridtrack.config.validate import validate
 from hybridtrack.config.writer import dump
 from hybridtrack.description import ChosenEstimator, Experiment, Initial, Window

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 
 from hybridtrack.config import checks
-from hybridtrack.config.exact import WITH_PLACE, exact_figure
-from hybridtrack.config.reader import Document, Keys
+from hybridtrack.config.exact import exact_figure
 from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
+from hybridtrack.config.reader import Document, Keys
 from hybridtrack.config.schema import ClaimForm, ScenarioForm
 from hybridtrack.containment import NOISE, set_metrics
 from hybridtrack.description import ChosenEstimator
@@ -72,7 +72,7 @@ def built_claim(
         raise document.error(path, "a claim needs one of 'estimator', 'compare' and 'figure'")
     exact = None
     for key in ("where", "than"):
-        if key == "where" and claim.figure in WITH_PLACE:
+        if key == "where" and claim.figure is not None and isinstance(form, NonlinearForm):
             continue
         if getattr(claim, key) is not None:
             raise document.error(

@@ -194,8 +194,8 @@ def _check_start(model: NonlinearModel, start: Array, document: Document) -> Non
                 if not np.isfinite(values[i]).all():
                     raise document.error(
                         (kind, name),
-                        f"'{shown(name)}' has no finite {what} at the start of the truth (a division "
-                        "by zero?); change it, or 'start'",
+                        f"'{shown(name)}' has no finite {what} at the start of the truth (a "
+                        "division by zero?); change it, or 'start'",
                     )
 
 
@@ -206,8 +206,8 @@ def _inputs(form: NonlinearForm, n_steps: int, document: Document) -> Array:
         if len(values) != n_steps:
             raise document.error(
                 ("inputs", name),
-                f"'{name}' has {len(values)} numbers and there are {n_steps} steps; give a number, or "
-                "one for each step",
+                f"'{name}' has {len(values)} numbers and there are {n_steps} steps; give a "
+                "number, or one for each step",
             )
     rows = n_steps if lists else 1
     columns = [

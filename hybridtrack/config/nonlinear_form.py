@@ -23,7 +23,6 @@ from hybridtrack.config.schema import (
 from hybridtrack.estimators import estimators
 
 Expression = str | float
-KINDS_OF_NOISE = KINDS
 
 if TYPE_CHECKING:
     SetEstimatorUnion: TypeAlias = Any
@@ -47,8 +46,8 @@ class SimulatedForm(Form):
 class NoiseForm(Form):
     """Half-axes of the noise's ellipsoids, in the states' units, and how noise is drawn.
 
-    With `contains_box` filters believe in ellipsoids around the box of the half-axes: n times Q, n_y
-    times R.
+    With `contains_box` filters believe in ellipsoids around the box of the half-axes: n times Q,
+    n_y times R.
     """
 
     kind: NoiseKind
@@ -72,12 +71,12 @@ class NonlinearForm(Form):
     name: Name
     title: str = ""
     source: str = ""
-    assumptions: list[str] = []
+    assumptions: list[str] = Field(default_factory=list)
     clock: ClockForm
     states: Annotated[list[Name], Field(min_length=1, max_length=12)]
-    angles: list[str] = []
-    constants: dict[Name, float] = {}
-    inputs: dict[Name, float | list[float]] = {}
+    angles: list[str] = Field(default_factory=list)
+    constants: dict[Name, float] = Field(default_factory=dict)
+    inputs: dict[Name, float | list[float]] = Field(default_factory=dict)
     dynamics: dict[str, Expression]
     measurement: Annotated[dict[Name, Expression], Field(min_length=1, max_length=12)]
     truth: SimulatedForm
@@ -85,11 +84,11 @@ class NonlinearForm(Form):
     initial: StartForm
     estimators: Annotated[dict[Name, SetEstimatorUnion], Field(min_length=1)]
     compare_with: str | None = None
-    windows: dict[Name, WindowForm] = {}
+    windows: dict[Name, WindowForm] = Field(default_factory=dict)
     scoring: ScoringForm = ScoringForm()
     analyses: AnalysesForm = Field(default={}, validate_default=True)
     monte_carlo: MonteCarloForm
-    published: list[ClaimForm] = []
+    published: list[ClaimForm] = Field(default_factory=list)
 
 
 AnyForm = ScenarioForm | NonlinearForm

@@ -309,7 +309,9 @@ class ClaimForm(Form):
     """
 
     claim: str
-    metric: Annotated[str | None, Field(json_schema_extra={"enum": [*METRICS, *FLAGS, *NOISE, None]})] = None
+    metric: Annotated[
+        str | None, Field(json_schema_extra={"enum": [*METRICS, *FLAGS, *NOISE, None]})
+    ] = None
     figure: str | None = None
     analysis: AnalysisName | None = None
     where: Cells | None = None

@@ -7,8 +7,8 @@ from pydantic import ValidationError
 
 from hybridtrack.config import units
 from hybridtrack.config.checks import nearest
-from hybridtrack.config.reader import Document, Keys, ScenarioError, shown
 from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
+from hybridtrack.config.reader import Document, Keys, ScenarioError, shown
 from hybridtrack.config.schema import MOTION_FORMS, MatricesForm, ModeForm, ScenarioForm
 from hybridtrack.estimators import estimators
 
@@ -240,7 +240,9 @@ def _unknown_tag(document: Document, path: Keys, expected: str) -> str:
     key, given = _tag_key(path), value_at(document, path)
     if path[-1] == key and isinstance(given, str) and key == "type" and given in estimators():
         needs = "'dynamics'" if estimators()[given].nonlinear else "'modes'"
-        return f"'type' is {given}, which is for scenarios with {needs}; there are {', '.join(names)}"
+        return (
+            f"'type' is {given}, which is for scenarios with {needs}; there are {', '.join(names)}"
+        )
     if path[-1] == key and given is not None:
         return f"'{key}' is {_shown(document, path)}, which is not known; {nearest(given, names)}"
     at = path[:-1] if path[-1] == key else path

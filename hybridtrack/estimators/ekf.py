@@ -8,6 +8,7 @@ import threading
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridtrack.ellipsoids import inverse, symmetric
 from hybridtrack.estimators import NO_KNOWN_MODES, Estimates
@@ -67,7 +68,7 @@ class Running:
         P = A @ self._covariance @ np.swapaxes(A, -1, -2) + self._Q
         C = model.measurement.jacobian(mean, u)
         innovation = measurement - model.measurement.value(mean, u)
-        missed = np.isnan(innovation).any(axis=1)
+        missed: NDArray[np.bool_] = np.asarray(np.isnan(innovation).any(axis=1))
         PC = P @ np.swapaxes(C, -1, -2)
         K = PC @ inverse(symmetric(C @ PC + self._R))
         left = np.eye(P.shape[-1]) - K @ C

@@ -16,7 +16,9 @@ from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hybridtrack.ellipsoids import Updated as Fused
 from hybridtrack.ellipsoids import (
     add,
     around_box,
@@ -26,7 +28,6 @@ from hybridtrack.ellipsoids import (
     trace,
     update,
 )
-from hybridtrack.ellipsoids import Updated as Fused
 from hybridtrack.errors import UserError
 from hybridtrack.estimators import NO_KNOWN_MODES, Estimates
 from hybridtrack.estimators._sets import Nonlinear, Sets, blank, estimates, note_points
@@ -175,7 +176,7 @@ class Running:
             beta = None if isinstance(settings.beta, str) else settings.beta
             R = add(_diagonal(around_box(radius, settings.box)), R, beta).shape
         innovation = y - guess
-        missed = np.isnan(innovation).any(axis=1)
+        missed: NDArray[np.bool_] = np.asarray(np.isnan(innovation).any(axis=1))
         innovation = np.where(missed[:, np.newaxis], 0.0, innovation)
 
         def fused(rho: Array) -> Fused:
@@ -293,7 +294,9 @@ class SetMembershipFilter(Nonlinear):
         for key in ("beta", "rho"):
             weight = getattr(settings, key)
             if not isinstance(weight, str) and not 0.0 < weight < 1.0:
-                raise UserError(f"'{key}' is {weight:g}; give a number between 0 and 1, without both")
+                raise UserError(
+                    f"'{key}' is {weight:g}; give a number between 0 and 1, without both"
+                )
         return model
 
     def begin(

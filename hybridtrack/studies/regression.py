@@ -8,6 +8,7 @@ and rarely large the other need many runs. A change smaller than rounding makes 
 is none. Where fewer than FEW runs have a figure, or a window is met too rarely, nothing is told.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from hybridtrack import columns
+from hybridtrack.containment import FLAGS, metrics_of
 from hybridtrack.errors import UserError
 from hybridtrack.models import Array
 from hybridtrack.results import DAMAGE
@@ -45,6 +47,7 @@ FEW = 8  # runs of which an error can be estimated at all
 SAME, UNCHANGED, WORSE, BETTER, UNTOLD = "same", "unchanged", "worse", "better", "untold"
 
 # Squared errors are told by their roots alone: both would be one test done twice.
+SMALLER = Metric("", False, "less", "")  # of sets, what isn't a flag is a size
 TESTED: Mapping[str, Metric] = {n: m for n, m in METRICS.items() if not n.endswith(("_m2", "_s2"))}
 DIVERGED = "diverged_runs"
 
@@ -99,15 +102,21 @@ class _Shard(NamedTuple):
         )
 
 
-def _shard(table: pa.Table) -> _Shard:
+def _quantities(table: pa.Table) -> tuple[str, ...]:
+    """What a table has sums of: QUANTITIES, and those of sets where it has any."""
+    names = [n.removesuffix("_sum") for n in table.column_names if n.endswith("_sum")]
+    return tuple(dict.fromkeys((*QUANTITIES, *names)))
+
+
+def _shard(table: pa.Table, quantities: tuple[str, ...]) -> _Shard:
     """A row group of runs.parquet, or of a baseline, which leaves out what no step has."""
     try:
-        return _read_shard(table)
+        return _read_shard(table, quantities)
     except DAMAGE:
         raise Mismatch("there are rows as no run writes them; renew it") from None
 
 
-def _read_shard(table: pa.Table) -> _Shard:
+def _read_shard(table: pa.Table, quantities: tuple[str, ...]) -> _Shard:
     estimators, windows = (columns.names_in(table[name]) for name in ("estimator", "window"))
     shape = (len(estimators), len(windows), -1)
     rows = columns.as_numpy(table["run"]).reshape(shape)
@@ -118,7 +127,7 @@ def _read_shard(table: pa.Table) -> _Shard:
             return np.full(rows.shape, np.nan if kind == "sum" else 0.0)
         return columns.as_numpy(table[name]).reshape(shape).astype(np.float64)
 
-    sums, numbers = (np.stack([values(q, kind) for q in QUANTITIES]) for kind in ("sum", "count"))
+    sums, numbers = (np.stack([values(q, kind) for q in quantities]) for kind in ("sum", "count"))
     sound = columns.as_numpy(table["status"]).reshape(shape)[:, 0] == 0
     place = tuple(int(columns.as_numpy(table[name])[0]) for name in ("case_number", "run"))
     return _Shard((place[0], place[1]), estimators, windows, sums, numbers, sound)
@@ -136,11 +145,27 @@ def hold_against(
 
     Raises UserError where their estimators or windows differ, or no run is in both.
     """
-    gathered = _paired(new, old) if paired else _unpaired(new, old)
+    new, old, quantities = _with_quantities(new, old)
+    of = _paired if paired else _unpaired
+    gathered = of(new, old, quantities)
     figures = list(gathered.figures())
     level = family_error / max(1, len(figures))
     changes = [_judge(figure, level, family_error, rounding) for figure in figures]
     return Comparison(changes, paired, gathered.runs, gathered.identical)
+
+
+def _with_quantities(
+    new: Iterable[pa.Table], old: Iterable[pa.Table]
+) -> tuple[Iterable[pa.Table], Iterable[pa.Table], tuple[str, ...]]:
+    """Both again, and the quantities that either has, by a look at its first shard."""
+    sides, found = [], dict.fromkeys(QUANTITIES)
+    for tables in (new, old):
+        rest = iter(tables)
+        first = list(itertools.islice(rest, 1))
+        for table in first:
+            found |= dict.fromkeys(_quantities(table))
+        sides.append(itertools.chain(first, rest))
+    return sides[0], sides[1], tuple(found)
 
 
 class _Figure(NamedTuple):
@@ -161,7 +186,9 @@ class _Figure(NamedTuple):
 class _Gathered:
     """Moments of all shards, by case."""
 
-    def __init__(self, paired: bool) -> None:
+    def __init__(self, paired: bool, quantities: tuple[str, ...]) -> None:
+        self.quantities = quantities
+        self.metrics = {**TESTED, **metrics_of(quantities)}
         self.estimators: list[str] = []
         self.windows: list[str] = []
         self.runs = 0
@@ -189,7 +216,7 @@ class _Gathered:
     def figures(self) -> Iterator[_Figure]:
         for e, estimator in enumerate(self.estimators):
             for w, window in enumerate(self.windows):
-                for name, metric in TESTED.items():
+                for name, metric in self.metrics.items():
                     found = self._figure(name, metric, estimator, window, e, w)
                     if found is not None:
                         yield found
@@ -205,7 +232,7 @@ class _Gathered:
         quantity = metric.quantity
         if estimator == "raw" and quantity == POSITION:
             quantity = POSITION_AT_SCANS
-        cell = (QUANTITIES.index(quantity), e, w)
+        cell = (self.quantities.index(quantity), e, w)
         if self.pairs:
             cases = [VectorMoments(*(of[cell] for of in case)) for case in self.pairs.values()]
             with np.errstate(all="ignore"):
@@ -262,9 +289,11 @@ class _Gathered:
                 counts[2] += int((~shard.sound[e]).sum())
 
 
-def _pairs(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> Iterator[tuple[_Shard, _Shard]]:
+def _pairs(
+    new: Iterable[pa.Table], old: Iterable[pa.Table], quantities: tuple[str, ...]
+) -> Iterator[tuple[_Shard, _Shard]]:
     """Shards of the same runs; both come in the order of cases and runs, cut alike."""
-    ours, theirs = map(_shard, new), map(_shard, old)
+    ours, theirs = ((_shard(table, quantities) for table in side) for side in (new, old))
     one, other = next(ours, None), next(theirs, None)
     while one is not None and other is not None:
         if one.place == other.place:
@@ -275,9 +304,11 @@ def _pairs(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> Iterator[tuple[_
         other = next(theirs, None) if ahead else other
 
 
-def _paired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
-    gathered = _Gathered(paired=True)
-    for ours, theirs in _pairs(new, old):
+def _paired(
+    new: Iterable[pa.Table], old: Iterable[pa.Table], quantities: tuple[str, ...]
+) -> _Gathered:
+    gathered = _Gathered(True, quantities)
+    for ours, theirs in _pairs(new, old, quantities):
         gathered.check(ours)
         gathered.check(theirs)
         gathered.add(ours, 0)
@@ -299,10 +330,12 @@ def _run_sums(shard: _Shard) -> RunSums:
     return RunSums(shard.sums, shard.numbers, sound)
 
 
-def _unpaired(new: Iterable[pa.Table], old: Iterable[pa.Table]) -> _Gathered:
-    gathered = _Gathered(paired=False)
+def _unpaired(
+    new: Iterable[pa.Table], old: Iterable[pa.Table], quantities: tuple[str, ...]
+) -> _Gathered:
+    gathered = _Gathered(False, quantities)
     for side, tables in enumerate((new, old)):
-        for shard in map(_shard, tables):
+        for shard in (_shard(table, quantities) for table in tables):
             gathered.check(shard)
             gathered.add(shard, side)
             gathered.note_diverged(shard, None, side)
@@ -336,7 +369,7 @@ def _judge(figure: _Figure, level: float, missed: float, rounding: float) -> Cha
     low, high = change - half, change + half
     verdict = SAME if change == 0.0 and figure.error == 0.0 else UNCHANGED
     if low > slack or high < -slack:
-        less = METRICS[figure.metric].better == "less"
+        less = {**TESTED, **FLAGS}.get(figure.metric, SMALLER).better == "less"
         verdict = WORSE if (change > 0) == less else BETTER
     return Change(*of, low, high, detectable, verdict)
 
