@@ -59,3 +59,11 @@ class Design(NamedTuple):
     def studied(self) -> float:
         """The optimum that local starts are held against."""
         return self.steps[self.settings.starts_points - 1].placement.worst_error
+
+
+def coarse(share: float) -> float:
+    """A share of starts to a twentieth: another machine's last bits send some starts elsewhere.
+
+    shares.parquet has it as it is.
+    """
+    return round(20.0 * share) / 20.0

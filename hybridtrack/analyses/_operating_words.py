@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hybridtrack.analyses._linearisation import PRINTED
-from hybridtrack.analyses._operating_design import TEN, Design
+from hybridtrack.analyses._operating_design import TEN, Design, coarse
 
 Row = Mapping[str, Any]
 
@@ -89,9 +89,9 @@ def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
             f"Even {_count(most)} don't keep {wanted}: with them the bound on {name} {settles}; "
             f"{leave}."
         ]
-    verb = "is" if design.needed == 1 else "are"
+    few, verb = ("One point", "is") if design.needed == 1 else (_count(design.needed), "are")
     said_first = (
-        f"{_count(design.needed).capitalize()} {verb} enough for {wanted}: the bound on {name} "
+        f"{few} {verb} enough for {wanted}: the bound on {name} "
         f"settles at {bounds[design.needed]:.3f}; {leave}."
     )
     fewer = bounds.get(design.needed - 1)
@@ -138,12 +138,13 @@ def _local(design: Design) -> list[str]:
         return []
     optimum = design.studied
     shares = ", ".join(
-        f"{100 * one.share_within(TEN, optimum):.0f} % by {one.solver}" for one in design.study
+        f"{100 * coarse(one.share_within(TEN, optimum)):.0f} % by {one.solver}"
+        for one in design.study
     )
     return [
         f"Of {design.settings.starts:,} random starts, "
         f"with {_count(design.settings.starts_points)}, "
-        f"within 10 % of the optimum end {shares}: the solver decides."
+        f"within 10 % of the optimum end about {shares}: the solver decides."
     ]
 
 

@@ -34,9 +34,10 @@ def place_several(
     high: Array,
     count: int,
     seed: int,
-    restarts: int = RESTARTS,
+    restarts: int | None = None,
 ) -> Placement:
     """The best `count` points in a box low (d,), high (d,) that the restarts find."""
+    restarts = RESTARTS if restarts is None else restarts
     places = lattice(low, high, PLACES)
     rng = np.random.default_rng([seed, count])
     found = []

@@ -25,7 +25,7 @@ from hybridtrack.analyses._placement_several import place_several, worst_of_seve
 from hybridtrack.analyses._steady_ellipsoids import Steady, steady, with_box
 from hybridtrack.models import Array
 
-NARROWED = 64  # cells that a pole is looked for in, and again in the first of them with one
+NARROWED, NARROWINGS = 64, 3  # cells that a pole is looked for in, and again in those with one
 SAMPLED = 9  # places of the range that the smallest bound is looked for at
 
 
@@ -209,15 +209,16 @@ class Procedure:
         (symbol,) = self.function.symbols
         for expression in self.function.expressions:
             second = sympy.diff(expression, symbol, 2)
-            edges = np.linspace(over.low[0], over.high[0], NARROWED + 1)
-            for _ in range(2):  # a wide cell's enclosure may be infinite for width alone
-                unbounded = np.flatnonzero(~np.isfinite(largest_size(second, symbol, edges)))
-                if not unbounded.size:
-                    break
-                first = int(unbounded[0])
-                edges = np.linspace(edges[first], edges[first + 1], NARROWED + 1)
-            else:
-                return np.array([0.5 * (edges[0] + edges[-1])])
+            cells = [(float(over.low[0]), float(over.high[0]))]
+            for _ in range(NARROWINGS):  # a cell's enclosure may be infinite for width alone
+                narrowed = []
+                for low, high in cells[:NARROWED]:
+                    edges = np.linspace(low, high, NARROWED + 1)
+                    unbounded = ~np.isfinite(largest_size(second, symbol, edges))
+                    narrowed += list(zip(edges[:-1][unbounded], edges[1:][unbounded], strict=True))
+                cells = narrowed
+            if cells:
+                return np.array([0.5 * (cells[0][0] + cells[0][1])])
         return None
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridtrack.models import Array
 
-STEPS = 20_000  # after which what still grows is said to grow for good
+STEPS = 5_000  # after which what still grows is said to grow for good
 SETTLED = 1e-10  # relative change per step
 DOUBLINGS = 40
 GROWN = 1e16  # times the start: it has no steady state
@@ -144,6 +144,8 @@ def steady(A: Array, C: Array, Q: Array, R: Array, rule: str, state: int = 0) ->
 
     state: the one that the best constants make the bound of smallest.
     """
+    if not seen(A, C):
+        return None
     if rule == BEST_CONSTANTS:
         return best_constants(A, C, Q, R, state)
     chosen = RULES[rule]
@@ -160,11 +162,22 @@ def steady(A: Array, C: Array, Q: Array, R: Array, rule: str, state: int = 0) ->
         fused = intersection(predicted, C, R, rho)
         if not np.trace(fused) < GROWN * largest:
             return None
-        std = np.sqrt(np.diagonal(fused))
+        std = np.sqrt(np.maximum(np.diagonal(fused), 0.0))  # of huge noise rounding may be left
         if (np.abs(fused - shape) <= SETTLED * np.outer(std, std)).all():
             return Steady(fused, beta, rho)
         shape = fused
     return None
+
+
+def seen(A: Array, C: Array) -> bool:
+    """Whether every part of the state that doesn't decay is measured, now or later."""
+    for eigenvalue in np.linalg.eigvals(A):
+        if abs(eigenvalue) >= 1.0 - 1e-9:
+            rows = np.vstack([eigenvalue * np.eye(len(A)) - A, C])
+            # a double eigenvalue is known to the root of rounding
+            if np.linalg.matrix_rank(rows, tol=1e-7 * max(float(np.abs(A).max()), 1.0)) < len(A):
+                return False
+    return True
 
 
 def around_sum(moved: Array, noise: Array, beta: float) -> Array:

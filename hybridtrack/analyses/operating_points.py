@@ -15,7 +15,14 @@ import numpy as np
 from hybridtrack.analyses import Analysis, Findings, Measured
 from hybridtrack.analyses._local_starts import LocalStarts, local_starts
 from hybridtrack.analyses._operating_charts import charts
-from hybridtrack.analyses._operating_design import OPTIMAL, TEN, WITHOUT, Design, Settings
+from hybridtrack.analyses._operating_design import (
+    OPTIMAL,
+    TEN,
+    WITHOUT,
+    Design,
+    Settings,
+    coarse,
+)
 from hybridtrack.analyses._operating_tables import (
     columns,
     ends,
@@ -100,9 +107,8 @@ def findings(name: str, system: System, settings: Settings, seed: int) -> Findin
             row["meets_wanted"] = procedure.meets(step, settings.rule, wanted)
         if step.name == OPTIMAL and len(step.placement.points) == settings.starts_points:
             for one in study:
-                row[f"share_within_10_percent_{one.solver}"] = one.share_within(
-                    TEN, step.placement.worst_error
-                )
+                share = one.share_within(TEN, step.placement.worst_error)
+                row[f"share_within_10_percent_{one.solver}"] = coarse(share)
         rows.append(row)
     for row in rows:
         row["points_needed"] = needed
@@ -160,7 +166,8 @@ def _range(name: str, procedure: Procedure, settings: Settings) -> Range:
         ends = given[state]
         if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
             raise UserError(
-                f"{name}: the range of {state} is {ends}; give two finite numbers, the lower first"
+                f"{name}: the range of {state} is {[*map(float, ends)]}; give two finite numbers, "
+                "the lower first"
             )
     low, high = (np.array([given[state][i] for state in states], dtype=float) for i in (0, 1))
     over = Range(low, high)
