@@ -173,7 +173,7 @@ def _range(name: str, procedure: Procedure, settings: Settings) -> Range:
     over = Range(low, high)
     place = procedure.not_finite(over)
     if place is not None:
-        where = ", ".join(f"{s} = {v:.6g}" for s, v in zip(states, place, strict=True))
+        where = ", ".join(f"{s} = {v:.4g}" for s, v in zip(states, place, strict=True))
         raise UserError(
             f"{name}: the dynamics, or their derivatives, have no value at {where}; choose a range "
             "without it"
