@@ -169,9 +169,10 @@ def analyze(
                 f"--as-printed: {analysis} has what is printed beside what is right already; leave "
                 "it out"
             )
-        settings.append(f"analyses.{analysis}.as_printed=true")
+        settings.append(f"analyses.{chosen.key}.as_printed=true")
     try:
         experiment = load_scenario(config, settings, runs, seed)
+        chosen.check(experiment)
         if chosen.wants_run is not None:
             wanted = chosen.wants_run(experiment)
             if wanted:

@@ -20,6 +20,7 @@ SHOWN = ("rmimm_fig5", "recorded_flight")
 ANALYSED = {
     "delay": "mode_delay_fig4",
     "observability": "observability_turns",
+    "operating-points": "switched_esmf",
 }  # whose output is shown
 EXAMPLES = {  # of Sigalov 2011, and what the truth is in each
     "softbound_ex1": "a soft bound",

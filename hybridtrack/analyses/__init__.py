@@ -61,6 +61,21 @@ class Analysis(NamedTuple):
     limits: Mapping[str, tuple[float | None, float | None]] = {}  # smallest, largest by setting
     # What it wants run before, as the scenario's settings (KEY.PATH=VALUE); None: no run.
     wants_run: Callable[[Experiment], tuple[str, ...]] | None = None
+    of_dynamics: bool = False  # about scenarios with `dynamics`, and not about modes
+
+    def check(self, experiment: Experiment) -> None:
+        """Raises Unsuited where a scenario is of the other kind."""
+        if experiment.nonlinear is not None and not self.of_dynamics:
+            raise Unsuited(
+                f"{self.name} is about modes, and this scenario has 'dynamics' instead; name one "
+                "with 'modes', or analyze operating-points",
+                "dynamics",
+            )
+
+    @property
+    def key(self) -> str:
+        """What its settings stand under in a scenario, where names have no hyphens."""
+        return self.name.replace("-", "_")
 
 
 @functools.cache
@@ -81,6 +96,8 @@ def lint(experiment: Experiment) -> list[str]:
     """
     from hybridtrack.analyses._short_stretches import warnings_about_legs
 
+    if experiment.nonlinear is not None:
+        return []
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             return warnings_about_legs(experiment)

@@ -150,6 +150,7 @@ def _start_of_truth(case: Case, names: Sequence[str], step: int) -> tuple[Array,
         known, values = truth.state_names, truth.state[min(step, len(truth.state) - 1)]
         which = f"the true state of '{case.name}' then"
     else:
+        assert isinstance(truth, ChainTruth)
         known, values = truth.bank.state_names, truth.initial_mean
         which = "the mean of the chain's own start"
     state = dict(zip(known, values.tolist(), strict=True))

@@ -47,6 +47,7 @@ from hybridtrack.analyses._switching_runs import (
 from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
 from hybridtrack.jumps import ChainTruth
+from hybridtrack.simulation import FixedTruth
 from hybridtrack.models import Array, JumpMarkovModel
 
 MOST_SOJOURNS_TRIED = 6
@@ -266,6 +267,7 @@ def _state_bound(
     for case in experiment.cases:
         if isinstance(case.truth, ChainTruth):
             return StateBound(np.full(len(names), math.inf), math.inf), ()
+        assert isinstance(case.truth, FixedTruth)
         flown = _in_order(case.truth.state, case.truth.state_names, names, math.inf)
         unknown = np.isnan(flown)
         gaps = gaps or bool(unknown[:, counts].any())
@@ -308,6 +310,7 @@ def _second_moment(experiment: Experiment, model: JumpMarkovModel) -> tuple[Arra
     if isinstance(truth, ChainTruth):
         start, there = truth.initial_mean, truth.bank.state_names
     else:
+        assert isinstance(truth, FixedTruth)
         start, there = truth.state[0], truth.state_names
     mean = _in_order(start[np.newaxis], there, names, math.nan)[0]
     unknown = [name for name, value in zip(names, mean, strict=True) if math.isnan(value)]
@@ -327,7 +330,7 @@ def _flown(experiment: Experiment) -> tuple[str, int] | None:
     """The mode of the flight's shortest stay that ends in a switch, and its steps."""
     shortest: tuple[str, int] | None = None
     for case in experiment.cases:
-        if isinstance(case.truth, ChainTruth) or not experiment.truth_modes:
+        if not isinstance(case.truth, FixedTruth) or not experiment.truth_modes:
             continue
         mode = case.truth.mode[1:]
         ends = np.flatnonzero(mode[1:] != mode[:-1]) + 1

@@ -22,7 +22,7 @@ from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
 from hybridtrack.jumps import ChainTruth
 from hybridtrack.models import Array, JumpMarkovModel
-from hybridtrack.simulation import two_point_start
+from hybridtrack.simulation import FixedTruth, two_point_start
 
 MOST_NUMBERS = 30_000_000  # kept of a simulation: 240 MB
 
@@ -141,6 +141,7 @@ def _started(
     if isinstance(truth, ChainTruth):
         names, values = truth.bank.state_names, truth.initial_mean
     else:
+        assert isinstance(truth, FixedTruth)
         names, values = truth.state_names, truth.state[0]
     there = dict(zip(names, np.nan_to_num(values).tolist(), strict=True))
     mean = np.array([there.get(name, 0.0) for name in model.state_names])

@@ -16,8 +16,11 @@ from hybridtrack.description import ChosenEstimator, Experiment, Initial, Window
 from hybridtrack.errors import UserError
 from hybridtrack.estimators import estimators
 from hybridtrack.models import Array, ModeBank
+from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case, FixedTruth
 from hybridtrack.verdicts import AnalysisClaim, Claim
+
+Claims = tuple[tuple[Claim, ...], tuple[AnalysisClaim, ...]]  # on runs, on analyses
 
 
 def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
@@ -43,16 +46,7 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         )
     windows = window_of(form, truth_modes, cases, document)
     sensor = truths.sensor(form, truth_modes, cases, initial.two_point, document)
-    claims = tuple(
-        built_claim(i, form, chosen, truth_modes, cases, sensor, document)
-        for i, claim in enumerate(form.published)
-        if claim.analysis is None
-    )
-    analysis_claims = tuple(
-        analysis_claim(i, form, document)
-        for i, claim in enumerate(form.published)
-        if claim.analysis is not None
-    )
+    claims = claims_of(form, chosen, truth_modes, cases, sensor, document)
     return Experiment(
         name=form.name,
         title=form.title or form.name,
@@ -70,13 +64,10 @@ def build(form: ScenarioForm, document: Document, folder: Path) -> Experiment:
         runs=form.monte_carlo.runs,
         seed=form.monte_carlo.seed,
         keep_tracks=min(form.monte_carlo.keep_tracks, form.monte_carlo.runs),
-        claims=claims,
-        analysis_claims=analysis_claims,
-        analyses={
-            name: one.settings(**dict(getattr(form.analyses, name)))
-            for name, one in analyses().items()
-        },
-        resolved=_resolved(form, (claims, analysis_claims), folder),
+        claims=claims[0],
+        analysis_claims=claims[1],
+        analyses=analyses_of(form),
+        resolved=_resolved(form, claims, folder),
     )
 
 
@@ -154,6 +145,36 @@ def _estimator(
     return ChosenEstimator(label, estimator, settings, bank)
 
 
+def analyses_of(form: AnyForm) -> dict[str, Any]:
+    """The settings of every analysis, by its name."""
+    return {
+        name: one.settings(**dict(getattr(form.analyses, one.key)))
+        for name, one in analyses().items()
+    }
+
+
+def claims_of(
+    form: AnyForm,
+    chosen: tuple[ChosenEstimator, ...],
+    truth_modes: tuple[str, ...],
+    cases: tuple[Case, ...],
+    sensor: Sensor,
+    document: Document,
+) -> Claims:
+    """Claims on runs, and on analyses."""
+    of_runs = tuple(
+        built_claim(i, form, chosen, truth_modes, cases, sensor, document)
+        for i, claim in enumerate(form.published)
+        if claim.analysis is None
+    )
+    of_analyses = tuple(
+        analysis_claim(i, form, document)
+        for i, claim in enumerate(form.published)
+        if claim.analysis is not None
+    )
+    return of_runs, of_analyses
+
+
 def window_of(
     form: AnyForm, truth_modes: tuple[str, ...], cases: tuple[Case, ...], document: Document
 ) -> tuple[Window, ...]:
@@ -219,16 +240,13 @@ def _check_span(name: str, window: WindowForm, cases: tuple[Case, ...], document
         )
 
 
-def _resolved(
-    form: ScenarioForm,
-    claims: tuple[tuple[Claim, ...], tuple[AnalysisClaim, ...]],
-    folder: Path,
-) -> dict[str, Any]:
+def written(form: AnyForm, claims: Claims) -> dict[str, Any]:
+    """The form as a scenario has it, with tolerances that were printed digits written out."""
     data = form.model_dump(by_alias=True, exclude_none=True)
     data["analyses"] = form.analyses.model_dump(exclude_defaults=True)
     of_runs, of_analyses = iter(claims[0]), iter(claims[1])
-    for written in data["published"]:
-        if "analysis" in written:
+    for claimed in data["published"]:
+        if "analysis" in claimed:
             figure = next(of_analyses)
             judged = figure.value is not None and figure.sign is None
             tolerance = figure.tolerance
@@ -237,7 +255,12 @@ def _resolved(
             judged = claim.value is not None and (claim.sign is None or claim.compare is not None)
             tolerance = claim.tolerance
         if judged:
-            written["tolerance"] = tolerance
+            claimed["tolerance"] = tolerance
+    return data
+
+
+def _resolved(form: ScenarioForm, claims: Claims, folder: Path) -> dict[str, Any]:
+    data = written(form, claims)
     recording = data["truth"].get("recording", {})
     for holder in (recording, recording.get("reference", {})):
         if "file" in holder and "package" not in holder:

@@ -6,7 +6,7 @@ from hybridtrack.config import checks
 from hybridtrack.config.exact import exact_figure
 from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
 from hybridtrack.config.reader import Document, Keys
-from hybridtrack.config.schema import ClaimForm, ScenarioForm
+from hybridtrack.config.schema import ClaimForm
 from hybridtrack.containment import NOISE, set_metrics
 from hybridtrack.description import ChosenEstimator
 from hybridtrack.sensors import Sensor
@@ -15,7 +15,7 @@ from hybridtrack.statistics import METRICS
 from hybridtrack.verdicts import AnalysisClaim, Claim, printed_tolerance
 
 
-def analysis_claim(i: int, form: ScenarioForm, document: Document) -> AnalysisClaim:
+def analysis_claim(i: int, form: AnyForm, document: Document) -> AnalysisClaim:
     """The i-th claim, on a figure of an analysis."""
     claim = form.published[i]
     path: Keys = ("published", i)

@@ -8,8 +8,8 @@ import numpy as np
 
 from hybridtrack.bounded import BoundedTruth, Noise
 from hybridtrack.config import checks
-from hybridtrack.config.build import window_of
-from hybridtrack.config.claims import built_claim, point_names
+from hybridtrack.config.build import Claims, analyses_of, claims_of, window_of, written
+from hybridtrack.config.claims import point_names
 from hybridtrack.config.nonlinear_form import NonlinearForm
 from hybridtrack.config.reader import Document, Keys, shown
 from hybridtrack.config.truths import times_of
@@ -56,10 +56,7 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
     _check_labels(form, document)
     windows = window_of(form, (), (case,), document)
     sensor = Sensor(model.measurement_noise_shape[np.newaxis], 1.0, 0)
-    claims = tuple(
-        built_claim(i, form, chosen, (), (case,), sensor, document)
-        for i in range(len(form.published))
-    )
+    claims = claims_of(form, chosen, (), (case,), sensor, document)
     return Experiment(
         name=form.name,
         title=form.title or form.name,
@@ -77,9 +74,9 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
         runs=form.monte_carlo.runs,
         seed=form.monte_carlo.seed,
         keep_tracks=min(form.monte_carlo.keep_tracks, form.monte_carlo.runs),
-        claims=claims,
-        analysis_claims=(),
-        analyses={},
+        claims=claims[0],
+        analysis_claims=claims[1],
+        analyses=analyses_of(form),
         resolved=_resolved(form, claims),
         nonlinear=model,
         point_names=point_names(form),
@@ -309,16 +306,8 @@ def _check_labels(form: NonlinearForm, document: Document) -> None:
             f"'compare_with' is {form.compare_with}, which is no estimator here; "
             f"{checks.nearest(form.compare_with, tuple(form.estimators))}",
         )
-    for i, claim in enumerate(form.published):
-        if claim.analysis is not None:
-            raise document.error(
-                ("published", i, "analysis"), "an analysis needs 'modes'; remove this claim"
-            )
 
 
-def _resolved(form: NonlinearForm, claims: Sequence[Any]) -> dict[str, Any]:
-    data = form.model_dump(by_alias=True, exclude_none=True)
-    for written, claim in zip(data["published"], claims, strict=True):
-        if claim.value is not None and (claim.sign is None or claim.compare is not None):
-            written["tolerance"] = claim.tolerance
+def _resolved(form: NonlinearForm, claims: Claims) -> dict[str, Any]:
+    data = written(form, claims)
     return {key: value for key, value in data.items() if value not in ("", [], {})}

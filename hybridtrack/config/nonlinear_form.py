@@ -7,6 +7,7 @@ from pydantic import Field
 from hybridtrack.bounded import KINDS
 from hybridtrack.config.schema import (
     ESTIMATOR_FORMS,
+    AnalysesForm,
     ClaimForm,
     ClockForm,
     Form,
@@ -85,6 +86,7 @@ class NonlinearForm(Form):
     compare_with: str | None = None
     windows: dict[Name, WindowForm] = Field(default_factory=dict)
     scoring: ScoringForm = ScoringForm()
+    analyses: AnalysesForm = Field(default={}, validate_default=True)
     monte_carlo: MonteCarloForm
     published: list[ClaimForm] = Field(default_factory=list)
 

@@ -172,7 +172,7 @@ ESTIMATOR_FORMS = {
     name: _settings_form("estimator", estimator, type=(Literal[name], ...))
     for name, estimator in estimators().items()
 }
-ANALYSIS_FORMS = {name: _settings_form("analysis", one) for name, one in analyses().items()}
+ANALYSIS_FORMS = {one.key: _settings_form("analysis", one) for one in analyses().values()}
 ANALYSES = tuple(analyses())
 
 if TYPE_CHECKING:  # which form it is, the scenario decides
@@ -186,7 +186,7 @@ else:
         "analyses",
         __base__=Form,
         __doc__="Settings of `hybridtrack analyze`, by analysis.",
-        **{name: (form, form()) for name, form in ANALYSIS_FORMS.items()},
+        **{key: (form, form()) for key, form in ANALYSIS_FORMS.items()},
     )
     ModeUnion = tagged(MOTION_FORMS, "motion", "matrices")
     EstimatorUnion = tagged(

@@ -65,6 +65,7 @@ def analyse(
     run: the finished run that the analysis wants. Raises UserError where the scenario cannot be
     analysed, or the folder is another's.
     """
+    analysis.check(experiment)
     own = digest(experiment, analysis)
     dossiers.prepare(folder, own)
     settings = experiment.analyses[analysis.name]

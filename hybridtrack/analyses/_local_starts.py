@@ -1,0 +1,51 @@
+"""What local solvers make of the placement, from many starts: figures 2 and 3 of Otanez 2004.
+
+The paper's is MATLAB's sequential quadratic programming, as it was in 2004. How often a start leads
+to the optimum depends on the solver as much as on the problem, so three are compared.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hybridtrack.analyses._linearisation import Nonlinear
+from hybridtrack.analyses._objective import SOLVERS, Objective
+from hybridtrack.models import Array
+
+WITHIN_PERCENT = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+
+
+class LocalStarts(NamedTuple):
+    """Where a solver ends from every start."""
+
+    solver: str
+    points: Array  # (starts, n, d)
+    worst_errors: Array  # (starts,)
+
+    def share_within(self, percent: float, optimum: float) -> float:
+        """Of the starts, those that end within so many per cent of the optimum."""
+        return float((self.worst_errors <= (1.0 + percent / 100.0) * optimum).mean())
+
+
+def local_starts(
+    function: Nonlinear, kind: str, low: Array, high: Array, count: int, starts: int, seed: int
+) -> list[LocalStarts]:
+    """Every solver from the same starts, uniform in the box low (d,), high (d,)."""
+    import warnings
+
+    rng = np.random.default_rng([seed, count])
+    begun = rng.uniform(low, high, (starts, count, len(low)))
+    objective = Objective(function, kind, (low, high), count)
+    found = []
+    for name, solver in SOLVERS.items():
+        ends = np.empty_like(begun)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a solver's steps out of bounds, which it clips
+            for i, start in enumerate(begun):
+                end = np.clip(solver(objective, start.ravel()).reshape(objective.shape), low, high)
+                # a solver that gave up below where it began hasn't gone anywhere
+                failed = not objective.worst(end.ravel()) <= objective.worst(start.ravel())
+                ends[i] = start if failed else end
+        worst = np.array([objective.worst(end.ravel()) for end in ends])
+        found.append(LocalStarts(name, ends, worst))
+    return found

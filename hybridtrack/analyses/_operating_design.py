@@ -1,0 +1,69 @@
+"""What is asked of the analysis of operating points, and what was found."""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+from hybridtrack.analyses._local_starts import LocalStarts
+from hybridtrack.analyses._procedure import Procedure, Range, Step
+
+WITHOUT, OPTIMAL = "without remainder", "optimal"  # what no other placement is called
+TEN = 10.0  # per cent above the optimum that the paper counts starts within
+
+
+class Settings(NamedTuple):
+    """range: low and high by state; wanted: the largest half-width by state; both in its unit.
+
+    weights: of components of the dynamics (by state) or of the measurement ("measured NAME"), to
+    compare errors of unlike units. placements: points by a name, to be compared: a number each, or
+    a list where several states vary. least_points: how many are tried although fewer would do.
+    starts: of the local solvers (0: none), with starts_points points.
+    """
+
+    range: dict[str, list[float]] | None = None
+    wanted: dict[str, float] | None = None
+    remainder: Literal["exact", "printed_eq40"] = "exact"
+    rule: Literal[
+        "trace_trace",
+        "trace_sqrt",
+        "determinant_determinant",
+        "trace_determinant",
+        "best_constants",
+    ] = "trace_trace"
+    weights: dict[str, float] | None = None
+    placements: dict[str, list[float | list[float]]] | None = None
+    least_points: int = 3
+    most_points: int = 6
+    starts: int = 1000
+    starts_points: int = 3
+
+
+class Design(NamedTuple):
+    """All that tables, sentences and figures are made of."""
+
+    procedure: Procedure
+    over: Range
+    wanted: Mapping[int, float]  # by state
+    state: int  # whose bound is told
+    steps: Sequence[Step]  # with 1, 2, ... points
+    given: Sequence[Step]
+    study: Sequence[LocalStarts]
+    needed: int | None  # the fewest points that meet what is wanted
+    settings: Settings
+
+    @property
+    def state_name(self) -> str:
+        """The state whose bound is told."""
+        return self.procedure.system.state_names[self.state]
+
+    @property
+    def studied(self) -> float:
+        """The optimum that local starts are held against."""
+        return self.steps[self.settings.starts_points - 1].placement.worst_error
+
+
+def coarse(share: float) -> float:
+    """A share of starts to a twentieth: another machine's last bits send some starts elsewhere.
+
+    shares.parquet has it as it is.
+    """
+    return round(20.0 * share) / 20.0

@@ -1,0 +1,175 @@
+"""The analysis of operating points in words: its table, its conclusions, what is wrong in print."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hybridtrack.analyses._linearisation import PRINTED
+from hybridtrack.analyses._operating_design import TEN, Design, coarse
+
+Row = Mapping[str, Any]
+
+MOST_SHOWN = 5  # points that a terminal has room for
+
+
+def shown(design: Design, rows: Sequence[Row]) -> dict[str, list[str]]:
+    """What a terminal shows: a line for each placement."""
+    name = design.state_name
+    states = design.procedure.function.states
+    cells = {
+        "points": [_named(row) for row in rows],
+        "worst\nerror": [_short(row["worst_error"]) if row["points"] else "" for row in rows],
+        "norm-\nalised": [_short(row["normalised_error"]) if row["points"] else "" for row in rows],
+    }
+    if len(states) == 1:
+        cells[f"at {states[0]} ="] = [_places(row, states[0]) for row in rows]
+    cells[f"bound\n{name}"] = [_short(row[f"bound_{name}"]) or "none" for row in rows]
+    if design.wanted:
+        cells["with-\nin"] = [_answer(row) for row in rows]
+    return cells
+
+
+def _named(row: Row) -> str:
+    if not row["points"]:
+        return "noise alone"
+    optimal = row["placement"] == "optimal"
+    return str(row["points"]) if optimal else f"{row['points']}: {row['placement']}"
+
+
+def _answer(row: Row) -> str:
+    return ("yes" if row["meets_wanted"] else "no") if row["points"] else ""
+
+
+def _places(row: Row, state: str) -> str:
+    values = [row[f"{state}_{i + 1}"] for i in range(row["points"])]
+    listed = " ".join(f"{value:.3f}" for value in values[:MOST_SHOWN])
+    return listed + " ..." * (len(values) > MOST_SHOWN)
+
+
+def _short(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def _percent(part: float) -> str:
+    """A small part, rounded up to a power of ten."""
+    return f"{10.0 ** math.ceil(math.log10(max(100.0 * part, 1e-7))):g} %"
+
+
+def _count(points: int) -> str:
+    return f"{points} point{'s' * (points != 1)}"
+
+
+# ---- conclusions -----------------------------------------------------------------------------
+
+
+def conclusions(design: Design, rows: Sequence[Row]) -> list[str]:
+    """What a practitioner should conclude, in whole sentences."""
+    return [*_how_many(design, rows), *_how_far(design), *_others(design), *_local(design)]
+
+
+def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
+    name = design.state_name
+    alone = rows[0][f"bound_{name}"]
+    leave = f"noise alone leaves {alone:.3f}"
+    bounds = {row["points"]: row[f"bound_{name}"] for row in rows if row["placement"] == "optimal"}
+    most = max(bounds)
+    if not design.wanted:
+        listed = ", ".join(
+            f"{bound:.3f} with {count}" for count, bound in bounds.items() if bound is not None
+        )
+        return [f"The bound on {name} settles at {listed or 'no value'} points; {leave}."]
+    wanted = " and ".join(
+        f"{design.procedure.system.state_names[j]} within {bound:g}"
+        for j, bound in design.wanted.items()
+    )
+    if design.needed is None:
+        last = bounds[most]
+        settles = "has no steady state" if last is None else f"settles at {last:.3f}"
+        return [
+            f"Even {_count(most)} don't keep {wanted}: with them the bound on {name} {settles}; "
+            f"{leave}."
+        ]
+    few, verb = ("One point", "is") if design.needed == 1 else (_count(design.needed), "are")
+    said_first = (
+        f"{few} {verb} enough for {wanted}: the bound on {name} "
+        f"settles at {bounds[design.needed]:.3f}; {leave}."
+    )
+    fewer = bounds.get(design.needed - 1)
+    if design.needed > 1:
+        was = "has none" if fewer is None else f"is {fewer:.3f}"
+        said_first = said_first[:-1] + f", and with one point fewer it {was}."
+    return [said_first]
+
+
+def _how_far(design: Design) -> list[str]:
+    steps = design.steps
+    first, last = steps[0].placement, steps[-1].placement
+    sentence = f"The worst linearisation error is {first.worst_error:.4g} with one point"
+    if len(steps) > 1:
+        sentence += f" and {last.worst_error:.4g} with {len(steps)}"
+    if all(step.placement.certificate for step in steps):
+        gap = max(
+            1.0 - step.placement.no_less_than / step.placement.worst_error
+            for step in steps
+            if step.placement.worst_error > 0.0
+        )
+        return [f"{sentence}; no other places are better by {_percent(gap)} of it."]
+    doubt = next(step.placement.doubt for step in reversed(steps) if step.placement.doubt)
+    return [f"{sentence}; that no other places are better is not certified ({doubt})."]
+
+
+def _others(design: Design) -> list[str]:
+    parts = []
+    for step in design.given:
+        count = len(step.placement.points)
+        if count <= len(design.steps):
+            best = design.steps[count - 1].placement.worst_error
+            more = 100.0 * (step.placement.worst_error / best - 1.0)
+            parts.append(f"'{step.name}' by {more:.0f} %")
+    if not parts:
+        return []
+    return [
+        f"The worst error of other placements is above the best of as many: {', '.join(parts)}."
+    ]
+
+
+def _local(design: Design) -> list[str]:
+    if not design.study:
+        return []
+    optimum = design.studied
+    shares = ", ".join(
+        f"{100 * coarse(one.share_within(TEN, optimum)):.0f} % by {one.solver}"
+        for one in design.study
+    )
+    return [
+        f"Of {design.settings.starts:,} random starts, "
+        f"with {_count(design.settings.starts_points)}, "
+        f"within 10 % of the optimum end about {shares}: the solver decides."
+    ]
+
+
+# ---- notes -----------------------------------------------------------------------------------
+
+
+def notes(design: Design) -> list[str]:
+    """What the paper prints wrongly or leaves open, and what was assumed."""
+    said_first = (
+        "errors as (40) prints them: the curvature at the state and no half, where (31) has it at "
+        "the point; neither is a bound at every place, `remainder: exact` is"
+        if design.settings.remainder == PRINTED
+        else "errors are |f(x) - f(c) - f'(c) (x - c)|; (40) of the paper is no bound of them"
+    )
+    found = [
+        said_first,
+        "normalised: by the largest curvature in the range (T v1 in the paper, which gives .129 so "
+        "and .006 as it is)",
+        "one model serves all components at a place; (32) lets each take its own, as no bank can",
+        "a bank's bound is its widest model's, with the worst error of each component everywhere; "
+        "a box of m components takes m r^2, where (22) prints 2",
+        f"beta and rho by {design.settings.rule}; the paper names no rule, and what is steady "
+        "depends on it (rules.parquet)",
+    ]
+    if len(design.procedure.function.components) > 1 and not design.settings.weights:
+        listed = ", ".join(design.procedure.function.components)
+        found.append(f"errors of {listed} are compared as they stand; see 'weights'")
+    return found
