@@ -17,7 +17,10 @@ from hybridtrack.studies.ledger import markdown
 README = Path(__file__).parent.parent / "README.md"
 PART = re.compile(r"(<!-- generated: (?P<what>[^>]+) -->\n)(?P<text>.*?)(<!-- end -->)", re.DOTALL)
 SHOWN = ("rmimm_fig5", "recorded_flight")
-ANALYSED = {"delay": "mode_delay_fig4", "operating-points": "switched_esmf"}  # whose output is shown
+ANALYSED = {  # whose output is shown
+    "delay": "mode_delay_fig4",
+    "operating-points": "switched_esmf",
+}
 EXAMPLES = {  # of Sigalov 2011, and what the truth is in each
     "softbound_ex1": "a soft bound",
     "softbound_ex2": "at most 4 transitions",
