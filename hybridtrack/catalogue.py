@@ -2,6 +2,7 @@
 
 from hybridtrack.analyses import analyses
 from hybridtrack.config import shipped
+from hybridtrack.containment import set_metrics
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
 from hybridtrack.statistics import CALIBRATION, METRICS
@@ -14,7 +15,8 @@ def catalogue() -> dict[str, dict[str, str]]:
         "motions": {name: m.summary.rstrip(".") for name, m in MOTION_MODELS.items()},
         "analyses": {name: one.summary for name, one in analyses().items()},
         "metrics": {name: m.summary for name, m in METRICS.items()}
-        | {CALIBRATION: "mean distance of that probability from how often it came true (ECE)"},
+        | {CALIBRATION: "mean distance of that probability from how often it came true (ECE)"}
+        | {name: m.summary for name, m in set_metrics(("STATE",), ("MODEL",)).items()},
         "scenarios": {name: _title(name) for name in shipped()},
     }
 

@@ -272,7 +272,8 @@ def test_list_and_schema(tmp_path):
     assert "coordinated_turn" in only
     assert "rmimm" not in only
     schema = json.loads(hybridtrack("schema", cwd=tmp_path).stdout)
-    assert "monte_carlo" in schema["properties"]
+    for form in ("ScenarioForm", "NonlinearForm"):
+        assert "monte_carlo" in schema["$defs"][form]["properties"]
 
 
 def test_a_folder_of_a_shipped_name_is_no_scenario(tmp_path):

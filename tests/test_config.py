@@ -837,6 +837,8 @@ def same(one: Any, other: Any, rtol: float = 0.0) -> bool:
             return False
         largest = np.max(np.abs(other), initial=0.0, where=np.isfinite(other))
         return np.allclose(one, other, 0.0, rtol * largest, equal_nan=True)
+    if callable(one):  # compiled of expressions, which are compared
+        return callable(other)
     return bool(one == other)
 
 

@@ -10,7 +10,9 @@ from hybridtrack.config.checks import nearest
 from hybridtrack.config.nonlinear_form import AnyForm, NonlinearForm
 from hybridtrack.config.reader import Document, Keys, ScenarioError, shown
 from hybridtrack.config.schema import MOTION_FORMS, MatricesForm, ModeForm, ScenarioForm
+from hybridtrack.containment import FAMILIES, FLAGS, NOISE
 from hybridtrack.estimators import estimators
+from hybridtrack.statistics import METRICS
 
 # Within these, no product of a few numbers overflows or vanishes: std^2, psd T^5, F P F'.
 SMALLEST, LARGEST = 1e-30, 1e30
@@ -182,7 +184,8 @@ def _sentence(document: Document, path: Keys, mistakes: Sequence[Mistake]) -> st
     if kind == "union_tag_invalid":
         return _unknown_tag(document, path, context["expected_tags"])
     if kind == "unknown_metric":
-        names = context["names"].split(", ")
+        own = (*FLAGS, *NOISE, *(f"{family}:..." for family in FAMILIES))
+        names = [*own, "position_rmse_m"] if "dynamics" in document.data else [*METRICS]
         return f"{label} is {here}, which is not known; {nearest(here, names)}"
     if "[key]" in mistake["loc"]:
         limit = "at most 64 characters" if kind == "string_too_long" else _LETTERS
