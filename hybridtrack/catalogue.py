@@ -2,6 +2,7 @@
 
 from hybridtrack.analyses import analyses
 from hybridtrack.config import shipped
+from hybridtrack.containment import set_metrics
 from hybridtrack.estimators import estimators
 from hybridtrack.motion import MOTION_MODELS
 from hybridtrack.statistics import CALIBRATION, FALSE_SWITCHES, METRICS
@@ -17,7 +18,8 @@ def catalogue() -> dict[str, dict[str, str]]:
         | {
             CALIBRATION: "mean distance of that probability from how often it came true (ECE)",
             FALSE_SWITCHES: "how often the mode estimate leaves the true mode, per stay in it",
-        },
+        }
+        | {name: m.summary for name, m in set_metrics(("STATE",), ("MODEL",)).items()},
         "scenarios": {name: _title(name) for name in shipped()},
     }
 

@@ -76,8 +76,7 @@ def median(values: Array) -> tuple[float, float]:
     middle = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
     if n < 4:
         return float(middle), np.nan
-    half = 0.5 * np.sqrt(n)
-    low = ordered[max(int(np.floor(0.5 * (n - 1) - half)), 0)]
-    high = ordered[min(int(np.ceil(0.5 * (n - 1) + half)), n - 1)]
-    with np.errstate(invalid="ignore"):
+    places = 0.5 * (n - 1) + 0.5 * np.sqrt(n) * np.array([-1.0, 1.0])
+    with np.errstate(invalid="ignore"):  # of medians among runs that diverged
+        low, high = np.interp(places, np.arange(n), ordered)
         return float(middle), float(0.5 * (high - low))

@@ -161,6 +161,24 @@ def test_what_is_not_met_by_the_most_points_is_said():
     assert rows(found.table)[-1]["points_needed"] is None
 
 
+@pytest.mark.parametrize(
+    ("settings", "number", "words"),
+    [
+        ((f"{SETTING}range={{psi: [0, 1000000]}}",), 1, "other places may be better by up to"),
+        ((f"{SETTING}range={{psi: [-3, 3]}}", f"{SETTING}remainder=exact"), 1, "not certified"),
+        (("dynamics.x=x + exp(20*psi)", f"{SETTING}wanted={{}}"), 0, "has no steady state"),
+        (
+            (f"{SETTING}wanted={{}}", f"{SETTING}most_points=2"),
+            0,
+            "1.528 with 1, 0.711 with 2 points",
+        ),
+    ],
+)
+def test_what_is_less_certain_is_said(settings, number, words):
+    fewest = (f"{SETTING}least_points=1", f"{SETTING}placements={{}}", "published=[]")
+    assert words in findings(*fewest, *settings).conclusions[number]
+
+
 def test_another_scenario_in_two_states(monkeypatch):
     """v cos(psi), its speed in the range too: nothing is certified, and it says so."""
     monkeypatch.setattr("hybridtrack.analyses._placement_several.RESTARTS", 1)

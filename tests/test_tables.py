@@ -49,6 +49,7 @@ def folder(tmp_path):
         ("published", published),
         ("comparisons", []),
         ("reliability", []),
+        ("sets", []),
         ("delays", []),
     ):
         columns = results.SCHEMAS[name].names

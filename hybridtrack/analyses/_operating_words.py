@@ -9,6 +9,7 @@ from hybridtrack.analyses._operating_design import TEN, Design, coarse
 
 Row = Mapping[str, Any]
 
+LOOSE = 0.01  # of an error: a certificate that says little
 MOST_SHOWN = 5  # points that a terminal has room for
 
 
@@ -77,7 +78,9 @@ def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
         listed = ", ".join(
             f"{bound:.3f} with {count}" for count, bound in bounds.items() if bound is not None
         )
-        return [f"The bound on {name} settles at {listed or 'no value'} points; {leave}."]
+        if not listed:
+            return [f"With up to {_count(most)} the bound on {name} has no steady state; {leave}."]
+        return [f"The bound on {name} settles at {listed} points; {leave}."]
     wanted = " and ".join(
         f"{design.procedure.system.state_names[j]} within {bound:g}"
         for j, bound in design.wanted.items()
@@ -113,6 +116,8 @@ def _how_far(design: Design) -> list[str]:
             for step in steps
             if step.placement.worst_error > 0.0
         )
+        if gap > LOOSE:  # a range of so many waves that the cells are too wide
+            return [f"{sentence}; other places may be better by up to {100.0 * gap:.0f} % of it."]
         return [f"{sentence}; no other places are better by {_percent(gap)} of it."]
     doubt = next(step.placement.doubt for step in reversed(steps) if step.placement.doubt)
     return [f"{sentence}; that no other places are better is not certified ({doubt})."]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridtrack.analyses._enclosures import largest_size
-from hybridtrack.analyses._linearisation import EXACT, Nonlinear, errors, lattice, of_bank
+from hybridtrack.analyses._linearisation import EXACT, Nonlinear, lattice, of_bank
 from hybridtrack.models import Array
 
 CELLS = 65_536  # of the range; the certificate's gap is about the error times 3/CELLS
@@ -293,12 +293,3 @@ def worst_of_one(function: Nonlinear, kind: str, low: float, high: float, points
         options={"xatol": 1e-12},
     )
     return max(float(found[peak]), -float(best.fun))
-
-
-def seams(function: Nonlinear, kind: str, low: float, high: float, points: Array) -> Array:
-    """Where the best model changes along a range of one state, to a lattice's cell."""
-    x = lattice(np.array([low]), np.array([high]), CHECKED)
-    owner = errors(function, kind, x, points).max(axis=-1).argmin(axis=-1)
-    changes = np.flatnonzero(np.diff(owner))
-    result: Array = 0.5 * (x[changes, 0] + x[changes + 1, 0])
-    return result

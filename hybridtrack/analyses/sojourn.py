@@ -47,8 +47,8 @@ from hybridtrack.analyses._switching_runs import (
 from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
 from hybridtrack.jumps import ChainTruth
-from hybridtrack.simulation import FixedTruth
 from hybridtrack.models import Array, JumpMarkovModel
+from hybridtrack.simulation import FixedTruth
 
 MOST_SOJOURNS_TRIED = 6
 SOJOURNS_LONG = 20  # how many of them a simulated run lasts, unless its length is given
