@@ -53,6 +53,7 @@ OUTCOMES = (
     ("useless_runs", "useless"),
 )
 MEDIAN_BOUND = "median_bound:"
+MEANINGLESS = 1000.0
 
 Rows = list[dict[str, Any]]
 
@@ -226,7 +227,7 @@ def _sets(
         table.add_column(Text(heading), justify="right", no_wrap=True)
     for label in labels:
         cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in OUTCOMES]
-        cells.append(f"{found[label, 'largest_normalised_error']['value']:.3g}")
+        cells.append(largest(found[label, "largest_normalised_error"]["value"]))
         medians = [found[label, figure] for figure in bounds]
         cells += [estimate(row["value"], row["standard_error"]) for row in medians]
         table.add_row(Text(label), *cells, *([switches.get(label, "")] if switches else []))
@@ -239,6 +240,11 @@ def _sets(
     )
     yield from map(Text, _of_noise(summary))
     yield from map(Text, _of_bounds(comparisons, manifest["compare_with"], found))
+
+
+def largest(error: float) -> str:
+    """A largest normalised error; how far beyond all measure it is tells of rounding alone."""
+    return f"{error:.3g}" if error < MEANINGLESS else f"> {MEANINGLESS:,.0f}"
 
 
 def _of_noise(summary: Rows) -> Iterator[str]:

@@ -115,7 +115,7 @@ def sets(folder: Path) -> str:
     lines = [f"| | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
     for label in dict.fromkeys(row["estimator"] for row in rows):
         cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables.OUTCOMES]
-        cells.append(f"{found[label, 'largest_normalised_error']['value']:.3g}")
+        cells.append(tables.largest(found[label, "largest_normalised_error"]["value"]))
         medians = [found[label, figure] for figure in bounds]
         cells += [tables.figure(row["value"], row["standard_error"]) for row in medians]
         lines.append(f"| `{label}` | {' | '.join(cells)} |")
