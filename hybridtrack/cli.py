@@ -132,7 +132,7 @@ def validate(
     """
     from hybridtrack import config as scenarios
     from hybridtrack.analyses import lint
-    from hybridtrack.tables import counted
+    from hybridtrack.typesetting import counted
 
     mistakes = 0
     for one in config:

@@ -149,7 +149,7 @@ def analyze(
     Prints a table and what to conclude from it, and writes both with figures into a folder. An
     analysis that compares with a Monte Carlo run makes it first, or takes the one that is there.
     """
-    from hybridtrack import tables
+    from hybridtrack import tables_of_analyses
     from hybridtrack.analyses import analyses
     from hybridtrack.config import located, nearest
     from hybridtrack.studies import analysis as studies
@@ -190,7 +190,7 @@ def analyze(
             say(f"complete already: {folder} is shown, not repeated (--force repeats it)")
     except Unsuited as error:
         raise located(config, settings, error.keys, str(error)) from None
-    for sentence in tables.surprises_of(record):
+    for sentence in tables_of_analyses.surprises_of(record):
         say(f"warning: {sentence}")
     if json:
         import json as encoder
@@ -199,7 +199,7 @@ def analyze(
         return
     from rich.console import Console
 
-    tables.show_analysis(record, Console(highlight=False))
+    tables_of_analyses.show_analysis(record, Console(highlight=False))
     if record["figures"]:
         print(f"figures: {folder / 'figures'}")
     print(folder)

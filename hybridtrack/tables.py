@@ -1,19 +1,18 @@
 """A run folder's results as text and as JSON; tables in, lines out."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from rich import box
 from rich.console import Console, RenderableType
-from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 from hybridtrack import results
-from hybridtrack.delays import MOST_ALREADY
-from hybridtrack.statistics import FALSE_SWITCHES
+from hybridtrack.tables_of_delays import delay_tables
+from hybridtrack.tables_of_sets import set_tables
+from hybridtrack.typesetting import counted, estimate, hanging, plain_table, print_parts
 
 # Metric, heading: what the main table shows, where the scenario has it.
 ERRORS = {
@@ -32,13 +31,7 @@ FINAL_MODE = (
     ("final_mode_prior_brier", "by the\ntime alone"),
     ("final_mode_calibration_error", "calibration\nerror"),
 )
-MOST_DECIMALS = 6  # more than that, and figures of a million on, take an exponent
-MOST_DIGITS = 6  # of a figure with an exponent, after its point
-SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
-WIDEST = 10_000
-LONG_TEXT = 40  # letters of a cell, beyond which it has several lines
 MOST_SENTENCES = 4  # of theory
-MOST_SWITCHES = 6  # whose delays are printed
 VERDICT_STYLES = {
     "reproduced": "green",
     "reproduced with stated assumptions": "green",
@@ -46,43 +39,8 @@ VERDICT_STYLES = {
     "not reproduced": "yellow",
 }
 
-OUTCOMES = (
-    ("violated_runs", "violated"),
-    ("emptied_runs", "emptied"),
-    ("diverged_runs", "diverged"),
-    ("useless_runs", "useless"),
-)
-MEDIAN_BOUND = "median_bound:"
-MEANINGLESS = 1000.0
 
 Rows = list[dict[str, Any]]
-
-
-def figure(value: float, error: float) -> str:
-    """A figure with its standard error, to the error's first digit: '17.94±0.04'."""
-    if math.isnan(value):
-        return ""
-    if math.isnan(error):
-        return f"{value:.4g}"
-    if error == 0.0 or math.isinf(value) or math.isinf(error):
-        return f"{value:.4g}±{error:.4g}"
-    last = math.floor(math.log10(error))  # place of the error's first digit
-    if max(abs(value), error) < 1e6 and -last <= MOST_DECIMALS:
-        decimals = max(-last, 0)
-        return f"{value:.{decimals}f}±{error:.{decimals}f}"
-    first = math.floor(math.log10(abs(value))) if value else last
-    return f"{value:.{min(max(first - last, 0), MOST_DIGITS)}e}±{error:.0e}"
-
-
-def estimate(value: float, error: float) -> str:
-    """As `figure`; an error below the value's last bit is rounding, of what every run has alike."""
-    alike = math.isfinite(value) and error < math.ulp(value)
-    return figure(value, 0.0 if alike else error)
-
-
-def counted(number: int, thing: str) -> str:
-    """'1 run', '2,000 runs'."""
-    return f"{number:,} {thing}{'s' * (number != 1)}"
 
 
 def show(path: Path, console: Console) -> None:
@@ -91,72 +49,7 @@ def show(path: Path, console: Console) -> None:
     No digit and no letter is left out: a table too wide for a terminal folds its names, then goes
     beyond the edge; on anything else than a terminal it is as wide as it needs to be.
     """
-    _print(_parts(path), console)
-
-
-def show_analysis(record: Mapping[str, Any], console: Console) -> None:
-    """Print a finished analysis, of which analysis.json is given, in the same way."""
-    _print(_parts_of(record), console)
-
-
-def _print(parts: Iterable[RenderableType], console: Console) -> None:
-    with console.capture() as captured:
-        for part in parts:
-            if isinstance(part, Table) and not part.expand:
-                part.width = _width(part, console)
-            console.print(part, crop=False)
-    lines = [line.rstrip() for line in captured.get().splitlines()]
-    console.file.write("\n".join([*lines, ""]))
-
-
-def _parts_of(record: Mapping[str, Any]) -> Iterator[RenderableType]:
-    yield Text(f"{record['title']}: {record['summary']}\n")
-    for one in record["shown"]:
-        if one["name"]:
-            yield Text(f"{one['name'].replace('_', ' ')}:")
-        yield _as_shown(one["columns"])
-        yield ""
-    for sentence in record["conclusions"]:
-        yield Text(sentence)
-    if record["notes"]:
-        yield ""
-        yield from (_hanging(note) for note in record["notes"])
-    if record["published"]:
-        yield ""
-        yield _published(record["published"])
-
-
-def _as_shown(columns: Mapping[str, list[str]]) -> Table:
-    """Texts by heading; names stand in the first column, or the first two, and long texts fold."""
-    table = _plain_table()
-    for i, (heading, cells) in enumerate(columns.items()):
-        long = max(map(len, cells), default=0) > LONG_TEXT
-        named = i < _columns_of_names(columns)
-        justify: Literal["left", "right"] = "left" if named or long else "right"
-        table.add_column(
-            Text(heading),
-            justify=justify,
-            overflow="fold",
-            no_wrap=not (named or long),
-            max_width=LONG_TEXT if long else None,
-        )
-    for row in zip(*columns.values(), strict=True):
-        table.add_row(*map(Text, row))
-    return table
-
-
-def _columns_of_names(columns: Mapping[str, list[str]]) -> int:
-    """How many of the first columns hold names."""
-    return 2 if list(columns)[:2] == ["from", "to"] else 1
-
-
-def _hanging(note: str) -> Table:
-    """A note behind a dash, its lines below one another."""
-    grid = Table.grid(padding=(0, 1), expand=True)
-    grid.add_column(width=1)
-    grid.add_column(ratio=1)
-    grid.add_row("-", Text(note, style="dim"))
-    return grid
+    print_parts(_parts(path), console)
 
 
 def _parts(path: Path) -> Iterator[RenderableType]:
@@ -172,13 +65,13 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     if comparisons:
         yield ""
         yield _ratios(comparisons, manifest["compare_with"], shown)
-    yield from _sets(results.read_rows(path, "sets"), summary, comparisons, manifest)
+    yield from set_tables(results.read_rows(path, "sets"), summary, comparisons, manifest)
     told = {row["estimator"] for row in summary if row["metric"] == FINAL_MODE[0][0]}
     if told:
         yield ""
         labels = [label for label in manifest["estimators"] if label in told]
         yield _summary("mode is the last", summary, labels, FINAL_MODE)
-    yield from _delays(results.read_rows(path, "delays"), summary)
+    yield from delay_tables(results.read_rows(path, "delays"), summary)
     for label, count in manifest.get("diverged", {}).items():
         yield Text(
             f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
@@ -192,163 +85,16 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     published = results.read_rows(path, "published")
     if published:
         yield ""
-        yield _published(published)
+        yield published_table(published)
 
 
 def _theory(sentences: list[str]) -> Iterator[RenderableType]:
     """What theory finds too short in the truth."""
     if sentences:
         yield "\ntoo short by theory (hybridtrack analyze observability):"
-        yield from (_hanging(sentence) for sentence in sentences[:MOST_SENTENCES])
+        yield from (hanging(sentence) for sentence in sentences[:MOST_SENTENCES])
         if len(sentences) > MOST_SENTENCES:
             yield f"and {len(sentences) - MOST_SENTENCES} more: hybridtrack validate --theory"
-
-
-def _sets(
-    sets: Rows, summary: Rows, comparisons: Rows, manifest: Mapping[str, Any]
-) -> Iterator[RenderableType]:
-    """What came of the sets, in how many runs; how wide they were; and sentences on both."""
-    found = {(row["estimator"], row["figure"]): row for row in sets}
-    labels = [label for label in manifest["estimators"] if (label, OUTCOMES[0][0]) in found]
-    if not labels:
-        return
-    bounds = [f for f in dict.fromkeys(r["figure"] for r in sets) if f.startswith(MEDIAN_BOUND)]
-    switches = {
-        row["estimator"]: estimate(row["value"], row["standard_error"])
-        for row in summary
-        if (row["metric"], row["window"]) == ("model_switches", "all")
-    }
-    yield ""
-    table = _plain_table()
-    table.add_column("sets: runs that", overflow="fold")
-    headings = [heading for _, heading in OUTCOMES]
-    headings += ["largest\nerror", *(f"bound on\n{f.removeprefix(MEDIAN_BOUND)}" for f in bounds)]
-    for heading in [*headings, *(["switches"] if switches else [])]:
-        table.add_column(Text(heading), justify="right", no_wrap=True)
-    for label in labels:
-        cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in OUTCOMES]
-        cells.append(largest(found[label, "largest_normalised_error"]["value"]))
-        medians = [found[label, figure] for figure in bounds]
-        cells += [estimate(row["value"], row["standard_error"]) for row in medians]
-        table.add_row(Text(label), *cells, *([switches.get(label, "")] if switches else []))
-    yield table
-    yield ""
-    yield Text(
-        "violated: the truth left the set; emptied: the noise broke its bounds; diverged: not "
-        "followed to the end; useless: no heading is excluded; error: (x-c)' S^-1 (x-c), 1 on the "
-        "boundary; bounds: medians over runs of the mean over time"
-    )
-    yield from map(Text, _of_noise(summary))
-    yield from map(Text, _of_bounds(comparisons, manifest["compare_with"], found))
-
-
-def largest(error: float) -> str:
-    """A largest normalised error; how far beyond all measure it is tells of rounding alone."""
-    return f"{error:.3g}" if error < MEANINGLESS else f"> {MEANINGLESS:,.0f}"
-
-
-def _of_noise(summary: Rows) -> Iterator[str]:
-    """Whether the noise kept the bounds that filters believe in."""
-    for kind in ("process", "measurement"):
-        for row in summary:
-            metric = f"{kind}_noise_outside_share"
-            if (row["metric"], row["window"]) == (metric, "all") and row["value"] > 0:
-                share = estimate(100 * row["value"], 100 * row["standard_error"])
-                yield f"the {kind} noise leaves its ellipsoid in {share} % of draws"
-
-
-def _of_bounds(
-    comparisons: Rows, reference: str | None, found: Mapping[tuple[str, str], dict[str, Any]]
-) -> Iterator[str]:
-    """How much wider the sets are than the reference's, of estimators that keep the truth."""
-    wider: dict[str, list[str]] = {}
-    sound = {
-        label for (label, f), row in found.items() if f == "violated_runs" and not row["value"]
-    }
-    for row in comparisons:
-        metric, first = row["metric"], row["first"]
-        if (
-            metric.startswith("mean_bound:")
-            and row["window"] == "all"
-            and {first, reference} <= sound
-        ):
-            state = metric.removeprefix("mean_bound:")
-            ours, theirs = (
-                found[x, MEDIAN_BOUND + state]["value"] for x in (first, reference or "")
-            )
-            more = 100 * (ours / theirs - 1)
-            if math.isfinite(more):
-                wider.setdefault(first, []).append(f"{state} {more:+.1f} %".replace("-", "−"))
-    for first, states in wider.items():
-        yield f"bounds of {first} against {reference}'s (medians): {', '.join(states)}"
-
-
-def _width(table: Table, console: Console) -> int:
-    """All that a table needs; on a terminal less where that is at the expense of names alone."""
-    options = console.options.update(width=WIDEST)
-    needed = Measurement.get(console, options, table).maximum
-    if not console.is_terminal:
-        return needed
-    names = [column for column in table.columns if not column.no_wrap and column.max_width is None]
-    longest = [max(len(str(cell)) for cell in (c.header, *c.cells)) for c in names]
-    spare = sum(max(length - SHORTEST_NAME, 0) for length in longest)
-    return max(min(needed, console.width), needed - spare)
-
-
-def _plain_table() -> Table:
-    return Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1), show_edge=False)
-
-
-def _delays(rows: Rows, summary: Rows) -> Iterator[RenderableType]:
-    """Steps until switches are noticed, a column for each; the start is none."""
-    keys = ("case", "switch", "from_mode", "to_mode")
-    found = [row for row in rows if row["from_mode"] is not None]
-    switches = list(dict.fromkeys(tuple(row[key] for key in keys) for row in found))
-    if not switches:
-        return
-    yield ""
-    several = len({switch[0] for switch in switches}) > 1
-    if len(switches) > MOST_SWITCHES or several:
-        yield Text(f"delays of {len(switches):,} switches: see delays.parquet")
-        return
-    table = _plain_table()
-    table.add_column(Text("delay in steps"), overflow="fold")
-    for switch in switches:
-        time_s = next(row["time_s"] for row in found if row["switch"] == switch[1])
-        when = "" if time_s is None else f"\n{time_s:g} s"
-        table.add_column(Text(f"{switch[2]}\nto {switch[3]}{when}"), justify="right", no_wrap=True)
-    table.add_column(Text("false\nper stay"), justify="right", no_wrap=True)
-    cells = {(row["estimator"], *(row[key] for key in keys)): delay(row) for row in found}
-    false = {
-        row["estimator"]: estimate(row["value"], row["standard_error"])
-        for row in summary
-        if row["metric"] == FALSE_SWITCHES
-    }
-    for label in dict.fromkeys(row["estimator"] for row in found):
-        own = (cells.get((label, *switch), "") for switch in switches)
-        table.add_row(Text(label), *own, false.get(label, ""))
-    yield table
-    if any("%" in cell for cell in cells.values()):
-        yield Text("median; in brackets the share of switches that are missed")
-    if any("*" in cell for cell in cells.values()):
-        yield Text(
-            f"*: in over {MOST_ALREADY:.0%} of the runs the estimate was so before the switch"
-        )
-
-
-def delay(row: Mapping[str, Any]) -> str:
-    """Of the run-averaged mode estimate; the median where every run has its own switches.
-
-    With the share of switches that are missed, and a star where the estimate had been the new
-    mode already.
-    """
-    if row["averaged_delay"] is not None:
-        text = str(row["averaged_delay"])
-    else:
-        median = row["median_delay_steps"]
-        text = "never" if math.isinf(median) else f"{median:.0f}"
-        text += f" ({row['missed_share']:.0%})" if row["missed_share"] >= 0.005 else ""
-    return text + "*" * bool(row["already_share"] > MOST_ALREADY)
 
 
 Columns = tuple[tuple[str, str], ...]  # metrics and their headings
@@ -378,7 +124,7 @@ def _by_metric(
 ) -> Table:
     """A row per estimator, a column per metric that there is."""
     metrics = [(m, h) for m, h in shown if any(key[1] == m for key in figures)]
-    table = _plain_table()
+    table = plain_table()
     table.add_column(Text(heading), overflow="fold")
     for _, text in metrics:
         text = text.partition(",")[0] if heading.startswith("ratio") else text
@@ -388,8 +134,8 @@ def _by_metric(
     return table
 
 
-def _published(published: Rows) -> Table:
-    table = _plain_table()
+def published_table(published: Rows) -> Table:
+    table = plain_table()
     table.expand = True
     table.add_column("verdict", width=18, overflow="fold")
     table.add_column("published claim", ratio=1, overflow="fold")
@@ -428,15 +174,10 @@ def surprises(path: Path) -> list[str]:
     there = {row["window"] for row in results.read_rows(path, "summary")}
     empty = [w for w in results.require_complete(path)["windows"] if w not in there]
     said = [f"window '{w}' holds no measured step, so it has no figures" for w in empty]
-    return said + _unexpected(results.read_rows(path, "published"))
+    return said + unexpected(results.read_rows(path, "published"))
 
 
-def surprises_of(record: Mapping[str, Any]) -> list[str]:
-    """The same of an analysis' verdicts."""
-    return _unexpected(record["published"])
-
-
-def _unexpected(published: Rows) -> list[str]:
+def unexpected(published: Rows) -> list[str]:
     return [
         f"'{row['claim']}' came out as: {row['verdict']}; expected: {row['expected_verdict']}"
         for row in published

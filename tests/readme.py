@@ -9,7 +9,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from hybridtrack import config, dossiers, experiment, results, tables
+from hybridtrack import (
+    config,
+    dossiers,
+    experiment,
+    results,
+    tables,
+    tables_of_analyses,
+    tables_of_sets,
+    typesetting,
+)
 from hybridtrack.analyses import analyses
 from hybridtrack.studies import analysis as studies
 from hybridtrack.studies.ledger import markdown
@@ -92,7 +101,7 @@ def generated(what: str, folders: dict[str, Path]) -> str:
         record = dossiers.read(folders[words])
         assert record is not None
         console = Console(file=out, width=80, highlight=False, no_color=True)
-        tables.show_analysis(record | {"published": []}, console)
+        tables_of_analyses.show_analysis(record | {"published": []}, console)
         folder = f"runs/{record['scenario']}-{record['analysis']}-DIGEST"
         lines = [line.rstrip() for line in out.getvalue().splitlines()]
         lines += ["..."] * bool(record["published"])  # the verdicts, which the ledger has
@@ -115,9 +124,9 @@ def sets(folder: Path) -> str:
     lines = [f"| | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
     for label in dict.fromkeys(row["estimator"] for row in rows):
         cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables.OUTCOMES]
-        cells.append(tables.largest(found[label, "largest_normalised_error"]["value"]))
+        cells.append(tables_of_sets.largest(found[label, "largest_normalised_error"]["value"]))
         medians = [found[label, figure] for figure in bounds]
-        cells += [tables.figure(row["value"], row["standard_error"]) for row in medians]
+        cells += [typesetting.figure(row["value"], row["standard_error"]) for row in medians]
         lines.append(f"| `{label}` | {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
 
@@ -127,7 +136,9 @@ def ratios(folders: dict[str, Path], scenarios: dict[str, str], labels: tuple[st
     lines = [f"| scenario | | {' | '.join(labels)} |", "| --- " * (len(labels) + 2) + "|"]
     for name, said in scenarios.items():
         found = {
-            (row["first"], row["metric"]): tables.figure(row["ratio"], row["ratio_standard_error"])
+            (row["first"], row["metric"]): typesetting.figure(
+                row["ratio"], row["ratio_standard_error"]
+            )
             for row in results.read_rows(folders[name], "comparisons")
             if row["window"] == "all"
         }

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import reference_observability as reference
-from hybridtrack import charts, config, page, tables
+from hybridtrack import charts, config, page, tables_of_analyses
 from hybridtrack.analyses import analyses, model_at_one_step
 from hybridtrack.analyses._errors_of_tests import (
     Spectrum,
@@ -1175,7 +1175,7 @@ def test_long_names_of_modes_fold_on_a_narrow_terminal():
         "published": [],
     }
     out = io.StringIO()
-    tables.show_analysis(
+    tables_of_analyses.show_analysis(
         record, Console(file=out, width=70, force_terminal=True, color_system=None)
     )
     lines = out.getvalue().splitlines()

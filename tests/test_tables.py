@@ -7,7 +7,7 @@ import math
 import pytest
 from rich.console import Console
 
-from hybridtrack import results, tables
+from hybridtrack import results, tables, typesetting
 
 LONG = "a_name_of_sixty_three_characters_" + "x" * 30
 
@@ -90,13 +90,13 @@ def shown(folder, width, terminal=False):
     ],
 )
 def test_a_figure_to_the_first_digit_of_its_error(value, error, text):
-    assert tables.figure(value, error) == text
+    assert typesetting.figure(value, error) == text
 
 
 def test_counts_agree_with_their_noun():
-    assert tables.counted(1, "run") == "1 run"
-    assert tables.counted(2000, "run") == "2,000 runs"
-    assert tables.counted(0, "step") == "0 steps"
+    assert typesetting.counted(1, "run") == "1 run"
+    assert typesetting.counted(2000, "run") == "2,000 runs"
+    assert typesetting.counted(0, "step") == "0 steps"
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_counts_agree_with_their_noun():
     ],
 )
 def test_an_error_below_the_last_bit_is_none(value, error, told):
-    assert tables.estimate(value, error) == told
+    assert typesetting.estimate(value, error) == told
 
 
 FIGURES = ("123456.789±0.001", "1.500e-09±2e-12", "0.5±inf", "3.140e+30±2e+27")

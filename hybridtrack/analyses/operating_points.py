@@ -36,7 +36,7 @@ from hybridtrack.analyses._operating_words import conclusions, notes, shown
 from hybridtrack.analyses._procedure import Procedure, Range, System
 from hybridtrack.analyses._steady_ellipsoids import Steady
 from hybridtrack.description import Experiment
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Unsuited
 from hybridtrack.expressions import number
 from hybridtrack.models import Array
 
@@ -44,16 +44,17 @@ MOST_STATES = 3  # that points are placed in
 
 
 def _analyse(experiment: Experiment, settings: Settings, measured: Measured | None) -> Findings:
-    return findings(experiment.name, system_of(experiment), settings, experiment.seed)
+    return findings(system_of(experiment), settings, experiment.seed)
 
 
 def system_of(experiment: Experiment) -> System:
-    """The scenario's nonlinear model, as expressions. Raises UserError where it has none."""
+    """The scenario's nonlinear model, as expressions. Raises Unsuited where it has none."""
     model = experiment.nonlinear
     if model is None:
-        raise UserError(
-            f"{experiment.name}: its models are linear, and have no operating points; give it "
-            "'dynamics', as switched_esmf has"
+        raise Unsuited(
+            "its models are linear, and have no operating points; give it "
+            "'dynamics', as switched_esmf has",
+            "modes",
         )
     dynamics, measurement = model.dynamics, model.measurement
     inputs: dict[Any, Any] = {}
@@ -61,9 +62,10 @@ def system_of(experiment: Experiment) -> System:
     for i, (name, values) in enumerate(zip(names, model.inputs.T, strict=True)):
         for map_ in (dynamics, measurement):
             if np.ptp(values) and any(one.has(map_.inputs[i]) for one in map_.gradient):
-                raise UserError(
-                    f"{experiment.name}: the input {name} changes over time and the linear models "
-                    "with it, so that nothing is steady; give it one number"
+                raise Unsuited(
+                    f"the input {name} changes over time and the linear models "
+                    "with it, so that nothing is steady; give it one number",
+                    "inputs",
                 )
             inputs[map_.inputs[i]] = number(float(values[0]))
     return System(
@@ -77,20 +79,20 @@ def system_of(experiment: Experiment) -> System:
     )
 
 
-def findings(name: str, system: System, settings: Settings, seed: int) -> Findings:
-    """All of it for a system; `name` is what complaints begin with. Raises UserError."""
-    weights = _weights(name, system, settings)
+def findings(system: System, settings: Settings, seed: int) -> Findings:
+    """All of it for a system. Raises Unsuited."""
+    weights = _weights(system, settings)
     procedure = Procedure(system, settings.remainder, weights, seed)
-    over = _range(name, procedure, settings)
-    wanted = _wanted(name, system, settings)
+    over = _range(procedure, settings)
+    wanted = _wanted(system, settings)
     state = next(iter(wanted), system.state_names.index(procedure.function.states[0]))
-    smallest = _smallest(name, procedure, over, settings.rule, state, wanted)
+    smallest = _smallest(procedure, over, settings.rule, state, wanted)
     least = max(settings.least_points, settings.starts_points if settings.starts else 1)
     most = max(settings.most_points, least)
     steps = list(procedure.steps(over, settings.rule, wanted, least, most))
     given = [
         procedure.step(over, label, procedure.given(over, points), settings.rule, state)
-        for label, points in _placements(name, over, settings).items()
+        for label, points in _placements(over, settings).items()
     ]
     met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
     needed = met.index(True) + 1 if True in met else None
@@ -132,55 +134,75 @@ def findings(name: str, system: System, settings: Settings, seed: int) -> Findin
 # ---- what is asked, checked ------------------------------------------------------------------
 
 
-def _range(name: str, procedure: Procedure, settings: Settings) -> Range:
+def _range(procedure: Procedure, settings: Settings) -> Range:
     states = procedure.function.states
     if not states:
-        raise UserError(
-            f"{name}: its dynamics are linear, so a linear model leaves no remainder wherever it "
-            "is placed; there is nothing to analyse here"
+        raise Unsuited(
+            "its dynamics are linear, so a linear model leaves no remainder wherever it "
+            "is placed; there is nothing to analyse here",
+            "dynamics",
         )
     if len(states) > MOST_STATES:
-        raise UserError(
-            f"{name}: the linearisation error depends on {len(states)} states "
+        raise Unsuited(
+            f"the linearisation error depends on {len(states)} states "
             f"({', '.join(states)}), and points are placed in {MOST_STATES} at most; make some of "
-            "them constants"
+            "them constants",
+            "dynamics",
         )
     given = settings.range or {}
     example = ", ".join(f"{state}: [low, high]" for state in states if state not in given)
     for state in given:
         if state not in procedure.system.state_names:
-            raise UserError(
-                f"{name}: 'range' has '{state}', which is no state; {_those(procedure)}"
+            raise Unsuited(
+                f"'range' has '{state}', which is no state; {_those(procedure)}",
+                "analyses",
+                "operating_points",
+                "range",
             )
         if state not in states:
-            raise UserError(
-                f"{name}: 'range' has '{state}', along which a linear model leaves no remainder; "
-                f"remove it, the remainder depends on {' and '.join(states)}"
+            raise Unsuited(
+                f"'range' has '{state}', along which a linear model leaves no remainder; "
+                f"remove it, the remainder depends on {' and '.join(states)}",
+                "analyses",
+                "operating_points",
+                "range",
             )
     if example:
-        raise UserError(
-            f"{name}: the range of {' and '.join(s for s in states if s not in given)} is not "
-            f"bounded; add analyses: {{operating_points: {{range: {{{example}}}}}}}"
+        raise Unsuited(
+            f"the range of {' and '.join(s for s in states if s not in given)} is not "
+            f"bounded; add analyses: {{operating_points: {{range: {{{example}}}}}}}",
+            "analyses",
+            "operating_points",
+            "range",
         )
     for state in states:
         ends = given[state]
         if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
-            raise UserError(
-                f"{name}: the range of {state} is {[*map(float, ends)]}; give two finite numbers, "
-                "the lower first"
+            raise Unsuited(
+                f"the range of {state} is {[*map(float, ends)]}; give two finite numbers, "
+                "the lower first",
+                "analyses",
+                "operating_points",
+                "range",
             )
     low, high = (np.array([given[state][i] for state in states], dtype=float) for i in (0, 1))
     over = Range(low, high)
     place = procedure.not_finite(over)
     if place is not None:
         where = ", ".join(f"{s} = {v:.4g}" for s, v in zip(states, place, strict=True))
-        raise UserError(
-            f"{name}: the dynamics, or their derivatives, have no value at {where}; choose a range "
-            "without it"
+        raise Unsuited(
+            f"the dynamics, or their derivatives, have no value at {where}; choose a range "
+            "without it",
+            "analyses",
+            "operating_points",
+            "range",
         )
     if not procedure.largest_curvature(over) > 0.0:
-        raise UserError(
-            f"{name}: over this range the dynamics are linear, so there is no remainder; widen it"
+        raise Unsuited(
+            "over this range the dynamics are linear, so there is no remainder; widen it",
+            "analyses",
+            "operating_points",
+            "range",
         )
     return over
 
@@ -189,39 +211,50 @@ def _those(procedure: Procedure) -> str:
     return f"the remainder depends on {' and '.join(procedure.function.states)}"
 
 
-def _weights(name: str, system: System, settings: Settings) -> dict[str, float]:
+def _weights(system: System, settings: Settings) -> dict[str, float]:
     weights = settings.weights or {}
     for component, weight in weights.items():
         if component not in system.component_names:
-            raise UserError(
-                f"{name}: 'weights' has '{component}', which is no component; there are "
-                f"{', '.join(system.component_names)}"
+            raise Unsuited(
+                f"'weights' has '{component}', which is no component; there are "
+                f"{', '.join(system.component_names)}",
+                "analyses",
+                "operating_points",
+                "weights",
             )
         if not 0.0 < weight < math.inf:
-            raise UserError(
-                f"{name}: the weight of {component} is {weight:g}; give a positive number"
+            raise Unsuited(
+                f"the weight of {component} is {weight:g}; give a positive number",
+                "analyses",
+                "operating_points",
+                "weights",
             )
     return weights
 
 
-def _wanted(name: str, system: System, settings: Settings) -> dict[int, float]:
+def _wanted(system: System, settings: Settings) -> dict[int, float]:
     wanted = {}
     for state, bound in (settings.wanted or {}).items():
         if state not in system.state_names:
-            raise UserError(
-                f"{name}: 'wanted' has '{state}', which is no state; there are "
-                f"{', '.join(system.state_names)}"
+            raise Unsuited(
+                f"'wanted' has '{state}', which is no state; there are "
+                f"{', '.join(system.state_names)}",
+                "analyses",
+                "operating_points",
+                "wanted",
             )
         if not 0.0 < bound < math.inf:
-            raise UserError(
-                f"{name}: the bound wanted of {state} is {bound:g}; give a positive number"
+            raise Unsuited(
+                f"the bound wanted of {state} is {bound:g}; give a positive number",
+                "analyses",
+                "operating_points",
+                "wanted",
             )
         wanted[system.state_names.index(state)] = bound
     return wanted
 
 
 def _smallest(
-    name: str,
     procedure: Procedure,
     over: Range,
     rule: str,
@@ -231,39 +264,53 @@ def _smallest(
     """Step 1, and whether what is wanted can be had at all."""
     found = procedure.smallest(over, rule, state)
     if found is None:
-        raise UserError(
-            f"{name}: without any remainder the ellipsoid has no steady state by the rule {rule} "
+        raise Unsuited(
+            f"without any remainder the ellipsoid has no steady state by the rule {rule} "
             "anywhere in the range (a part of the state that doesn't decay is not measured); "
-            "choose another rule or measurement"
+            "choose another rule or measurement",
+            "dynamics",
         )
     for j, bound in wanted.items():
         own = procedure.smallest(over, rule, j)
         least = math.inf if own is None else float(own.half_widths[j])
         if bound < least:
-            raise UserError(
-                f"{name}: {procedure.system.state_names[j]} is wanted within {bound:g}, and the "
+            raise Unsuited(
+                f"{procedure.system.state_names[j]} is wanted within {bound:g}, and the "
                 f"noise alone leaves {least:.4g} in steady state, however many points there are; "
-                f"want at least that, or another rule than {rule}"
+                f"want at least that, or another rule than {rule}",
+                "analyses",
+                "operating_points",
+                "wanted",
             )
     return found
 
 
-def _placements(name: str, over: Range, settings: Settings) -> dict[str, Array]:
+def _placements(over: Range, settings: Settings) -> dict[str, Array]:
     found, d = {}, len(over.low)
     for label, listed in (settings.placements or {}).items():
         if label in (WITHOUT, OPTIMAL):
-            raise UserError(f"{name}: a placement can't be called '{label}'; rename it")
+            raise Unsuited(
+                f"a placement can't be called '{label}'; rename it",
+                "analyses",
+                "operating_points",
+                "placements",
+            )
         points = [point if isinstance(point, list) else [point] for point in listed]
         if not points or any(len(point) != d for point in points):
-            raise UserError(
-                f"{name}: the placement '{label}' needs {d} number{'s' * (d > 1)} for each of its "
-                "points; correct it"
+            raise Unsuited(
+                f"the placement '{label}' needs {d} number{'s' * (d > 1)} for each of its "
+                "points; correct it",
+                "analyses",
+                "operating_points",
+                "placements",
             )
         array = np.array(points, dtype=float)
         if not ((array >= over.low) & (array <= over.high)).all():
-            raise UserError(
-                f"{name}: the placement '{label}' has a point outside the range; move it, or widen "
-                "'range'"
+            raise Unsuited(
+                f"the placement '{label}' has a point outside the range; move it, or widen 'range'",
+                "analyses",
+                "operating_points",
+                "range",
             )
         found[label] = array
     return found
