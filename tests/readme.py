@@ -119,11 +119,11 @@ def sets(folder: Path) -> str:
     rows = results.read_rows(folder, "sets")
     found = {(row["estimator"], row["figure"]): row for row in rows}
     bounds = [f for f in dict.fromkeys(row["figure"] for row in rows) if f.startswith("median")]
-    heads = [heading for _, heading in tables.OUTCOMES] + ["largest error"]
+    heads = [heading for _, heading in tables_of_sets.OUTCOMES] + ["largest error"]
     heads += [f"bound on {figure.partition(':')[2]}" for figure in bounds]
     lines = [f"| | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
     for label in dict.fromkeys(row["estimator"] for row in rows):
-        cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables.OUTCOMES]
+        cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables_of_sets.OUTCOMES]
         cells.append(tables_of_sets.largest(found[label, "largest_normalised_error"]["value"]))
         medians = [found[label, figure] for figure in bounds]
         cells += [typesetting.figure(row["value"], row["standard_error"]) for row in medians]
