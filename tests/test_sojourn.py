@@ -35,7 +35,7 @@ from hybridtrack.analyses._switching_runs import Claimed, switching_runs
 from hybridtrack.analyses.sojourn import ANALYSIS, Settings, _second_moment, sojourn_study
 from hybridtrack.config import ScenarioError, load, shipped
 from hybridtrack.errors import Unsuited, UserError
-from hybridtrack.tables import LONG_TEXT
+from hybridtrack.tables_of_analyses import LONG_TEXT
 from models import figure_5_model, random_model
 
 PRINTED = 1e-4  # relative: the figures are held to this; four digits or more were noted
