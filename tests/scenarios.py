@@ -9,9 +9,11 @@ from unittest.mock import patch
 import pytest
 from hypothesis import strategies as st
 
-from hybridtrack.config import Experiment, dump, load, truths
+from hybridtrack.config import Experiment, dump, load, shipped, truths
 from hybridtrack.config.reader import read
 from hybridtrack.errors import UserError
+
+WITH_MODES = tuple(name for name in sorted(shipped()) if load(name).nonlinear is None)
 
 FIG5 = Path(__file__).parent.parent / "configs" / "rmimm_fig5.yaml"
 

@@ -42,9 +42,10 @@ from hybridtrack.analyses._telling_apart import outputs_of, settled_covariance, 
 from hybridtrack.errors import UserError
 from hybridtrack.verdicts import Interval, judge_interval
 from models import figure_5_model, random_model
+from scenarios import WITH_MODES
 
 SEEDS = st.integers(0, 2**32 - 1)
-NAMES = sorted(config.shipped())
+NAMES = WITH_MODES
 
 
 def scalar(gain, noise, initial=1.0, mean=0.0, process=0.0, name=None):

@@ -33,10 +33,11 @@ from hybridtrack.analyses._sojourn_numbers import number
 from hybridtrack.analyses._sojourn_observability import joint_observability
 from hybridtrack.analyses._switching_runs import Claimed, switching_runs
 from hybridtrack.analyses.sojourn import ANALYSIS, Settings, _second_moment, sojourn_study
-from hybridtrack.config import ScenarioError, load, shipped
+from hybridtrack.config import ScenarioError, load
 from hybridtrack.errors import Unsuited, UserError
 from hybridtrack.tables_of_analyses import LONG_TEXT
 from models import figure_5_model, random_model
+from scenarios import WITH_MODES
 
 PRINTED = 1e-4  # relative: the figures are held to this; four digits or more were noted
 ROUNDING = 1e-9  # relative: a few thousand products at 1e-16 each, and conditions of some 1e3
@@ -786,7 +787,7 @@ def check(found):
             assert (np.isnan(line.y) | (line.y > 0)).all()
 
 
-@pytest.mark.parametrize("name", sorted(shipped()))
+@pytest.mark.parametrize("name", WITH_MODES)
 def test_every_shipped_scenario_gives_findings_or_says_why(name):
     try:
         found = findings(name, f"{KEY}simulated_runs=200")

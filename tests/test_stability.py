@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 import reference
 import reference_stability as slow
-from hybridtrack import config
 from hybridtrack.analyses import _mixing, _riccati
 from hybridtrack.analyses import stability as room
 from hybridtrack.analyses._definite import is_definite, is_singular, join, meet, square_root
@@ -18,7 +17,7 @@ from hybridtrack.config import load
 from hybridtrack.errors import UserError
 from hybridtrack.vectors import WIDTH
 from models import RANDOM, SMALL, random_model, scenario, unpacked
-from scenarios import CHAIN
+from scenarios import CHAIN, WITH_MODES
 
 SEEDS = st.integers(0, 2**32 - 1)
 MANY = settings(max_examples=60, deadline=None)
@@ -1006,7 +1005,7 @@ def check_shape(found):
     assert all(s[0].isupper() and s.endswith(".") and "nan" not in s for s in found.conclusions)
 
 
-@pytest.mark.parametrize("name", sorted(config.shipped()))
+@pytest.mark.parametrize("name", WITH_MODES)
 def test_every_shipped_scenario_has_findings(name):
     found = analyse(load(name, ["analyses.stability.steps=200"]))
     check_shape(found)

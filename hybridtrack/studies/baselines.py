@@ -21,8 +21,8 @@ from hybridtrack.statistics import QUANTITIES
 RENEW = "renew it with `hybridtrack baseline`"
 KEY = b"hybridtrack_baseline"
 FORM = 1  # of the file, for later readers
-# Of the resolved scenario, what only tells of it.
-TOLD = ("title", "source", "assumptions", "published")
+# Of the resolved scenario, what only tells of it, or is about no run.
+TOLD = ("title", "source", "assumptions", "published", "analyses")
 
 
 class Baseline(NamedTuple):
