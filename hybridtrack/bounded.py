@@ -152,7 +152,7 @@ class BoundedRuns:
         """States (steps, lanes, n_x), measurements (steps, lanes, n_y), and what lies outside.
 
         The last is (steps, lanes, 2): 1 where the process noise, and where the measurement noise,
-        is outside its ellipsoid, else 0.
+        is outside the ellipsoid that filters believe in, else 0.
         """
         model, lanes = self._truth.model, self._lanes
         w = self._process.advance(steps)[:, :lanes]
@@ -173,7 +173,7 @@ class BoundedRuns:
                 centre, shape = self.opponent.advance(measurements[k])
                 self.opponent = self.opponent._replace(centre=centre, shape=shape)
             self._step += 1
-        far = [outside(w, self._truth.process.shape), outside(v, self._truth.measurement.shape)]
+        far = [outside(w, model.process_noise_shape), outside(v, model.measurement_noise_shape)]
         return states, measurements, np.stack(far, axis=-1).astype(np.float64)
 
     def _push(self, ahead: Array, direction: Array, u: Array) -> Array:

@@ -8,10 +8,12 @@ stands there. SymPy takes a third of a second to import, so it is where a scenar
 import ast
 import difflib
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridtrack.errors import UserError
 from hybridtrack.models import Array
@@ -19,6 +21,7 @@ from hybridtrack.models import Array
 LONGEST, DEEPEST, MOST_PARTS = 1000, 60, 150  # so that differentiating takes no second
 LARGEST_POWER = 20
 LARGEST_NUMBER = 1e30
+MOST_OPERATIONS = 5000  # of one derivative
 MOST_TERMS = 200  # that an expression may be expanded to, to look what it is made of
 DIGITS = 17  # of a float, so that it is the same when read again
 FUNCTIONS = (
@@ -34,6 +37,8 @@ Lanes = Callable[[Array, Array], Array]
 class ExpressionError(UserError):
     """What is wrong with an expression and what to write instead, without its place."""
 
+    component = 0  # which of several expressions it is about
+
 
 def parse(text: str, names: Mapping[str, Any]) -> Any:
     """The SymPy expression of a text; names: what each name in it stands for (symbols, numbers).
@@ -45,7 +50,9 @@ def parse(text: str, names: Mapping[str, Any]) -> Any:
     if len(text) > LONGEST:
         raise ExpressionError(f"it has {len(text)} characters and may have {LONGEST}; shorten it")
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        with warnings.catch_warnings():  # "1if x else y" is refused below, and need not warn
+            warnings.simplefilter("ignore")
+            tree = ast.parse(text.strip(), mode="eval").body
     except (RecursionError, MemoryError):
         raise ExpressionError(f"it is nested deeper than {DEEPEST} levels; flatten it") from None
     except (SyntaxError, ValueError) as error:
@@ -56,6 +63,7 @@ def parse(text: str, names: Mapping[str, Any]) -> Any:
         ) from None
     found = _Reader(names).read(tree, 0)
     _refuse_undefined(found)
+    _refuse_unknown(found)
     return found
 
 
@@ -81,6 +89,26 @@ def _refuse_undefined(expression: Any) -> None:
         raise ExpressionError(
             "it has no real value (a division by zero, or a root or logarithm of a negative "
             "number); change it"
+        )
+
+
+def _refuse_unknown(expression: Any) -> None:
+    """SymPy makes of sqrt(x**2) an Abs, and of its derivatives sign and DiracDelta."""
+    import sympy
+
+    known = (sympy.Add, sympy.Mul, sympy.Pow, sympy.Symbol, sympy.Number, sympy.NumberSymbol)
+    functions = tuple(getattr(sympy, name) for name in FUNCTIONS if name != "sqrt")
+    for part in sympy.preorder_traversal(expression):
+        if isinstance(part, known + functions):
+            continue
+        if isinstance(part, sympy.Abs | sympy.sign | sympy.DiracDelta | sympy.Heaviside):
+            raise ExpressionError(
+                "it has a kink (as sqrt(x**2) has where x = 0), so it has no derivative there; "
+                "write it without"
+            )
+        raise ExpressionError(
+            f"it or a derivative comes to hold {type(part).__name__}, which is not known here; "
+            "write it otherwise"
         )
 
 
@@ -245,12 +273,21 @@ def symbols(names: Sequence[str], kind: str) -> tuple[Any, ...]:
 
 
 def compiled(expressions: Sequence[Any], states: Sequence[Any], inputs: Sequence[Any]) -> Map:
-    """Differentiate and compile expressions in the symbols of states and inputs."""
-    import sympy
+    """Differentiate and compile expressions in the symbols of states and inputs.
 
+    Raises ExpressionError, with its component, about one whose derivatives are none or too long.
+    """
     n, n_x = len(expressions), len(states)
-    gradient = [sympy.diff(one, x) for one in expressions for x in states]
-    curvature = [sympy.diff(one, x) for one in gradient for x in states]
+    gradient: list[Any] = []
+    curvature: list[Any] = []
+    for i, one in enumerate(expressions):
+        try:
+            slopes = [_derivative(one, x) for x in states]
+            curvature += [_derivative(slope, x) for slope in slopes for x in states]
+        except ExpressionError as error:
+            error.component = i
+            raise
+        gradient += slopes
     arguments = (*states, *inputs)
     return Map(
         expressions=tuple(expressions),
@@ -262,6 +299,40 @@ def compiled(expressions: Sequence[Any], states: Sequence[Any], inputs: Sequence
         jacobian=_over_lanes(arguments, gradient, (n, n_x)),
         hessian=_over_lanes(arguments, curvature, (n, n_x, n_x)),
     )
+
+
+def _derivative(expression: Any, symbol: Any) -> Any:
+    import sympy
+
+    found = sympy.diff(expression, symbol)
+    if sympy.count_ops(found) > MOST_OPERATIONS:
+        raise ExpressionError(
+            f"a derivative of it has more than {MOST_OPERATIONS:,} operations; shorten it"
+        )
+    _refuse_unknown(found)
+    return found
+
+
+def constants_of_states(map_: Map) -> tuple[Any, ...]:
+    """The largest parts of a map and of its derivatives that hold inputs and no states."""
+    inputs, found, seen = set(map_.inputs), dict[Any, None](), set[Any]()
+    waiting = [*map_.expressions, *map_.gradient, *map_.curvature]
+    while waiting:
+        one = waiting.pop()
+        if one in seen or not one.free_symbols & inputs:
+            continue
+        seen.add(one)
+        if one.free_symbols <= inputs:
+            found[one] = None
+        else:
+            waiting.extend(one.args)
+    return tuple(sorted(found, key=str))
+
+
+def not_finite(expression: Any, map_: Map, inputs: Array) -> NDArray[np.bool_]:
+    """At which inputs (m, n_u) an expression of them alone has no finite value."""
+    values = _over_lanes(map_.inputs, [expression], (1,))(inputs, np.zeros(0))
+    return ~np.isfinite(values[:, 0])
 
 
 def _over_lanes(arguments: Sequence[Any], flat: list[Any], shape: tuple[int, ...]) -> Lanes:
@@ -303,8 +374,10 @@ class Wave(NamedTuple):
 
     def phasor(self, u: Array) -> tuple[float, float]:
         """Amplitude and phase of the sum of its parts."""
-        total = sum(complex(a(*u)) * complex(math.cos(p), math.sin(p)) for a, p in self.parts)
-        return abs(total), math.atan2(total.imag, total.real)
+        u = np.asarray(u, dtype=np.float64)  # NumPy has NaN where `math` raises
+        with np.errstate(all="ignore"):
+            total = sum(complex(a(*u)) * complex(math.cos(p), math.sin(p)) for a, p in self.parts)
+        return math.hypot(total.real, total.imag), math.atan2(total.imag, total.real)
 
 
 def waves(map_: Map) -> tuple[tuple[Wave, ...] | None, ...]:
@@ -322,7 +395,7 @@ def _waves(expression: Any, map_: Map) -> tuple[Wave, ...] | None:
         return None
     found: dict[tuple[int, float], list[tuple[Any, float]]] = {}
     states = set(map_.states)
-    for term in sympy.Add.make_args(sympy.expand_mul(sympy.expand_multinomial(expression))):
+    for term in sympy.Add.make_args(_expanded(expression)):
         factors = [one for one in sympy.Mul.make_args(term) if one.free_symbols & states]
         if not factors or (len(factors) == 1 and factors[0] in states):
             continue  # a constant, or a state times one
@@ -333,7 +406,7 @@ def _waves(expression: Any, map_: Map) -> tuple[Wave, ...] | None:
             return None
         state, w, phase = turning
         shift = phase - (math.pi / 2 if factors[0].func is sympy.sin else 0.0)
-        amplitude = sympy.lambdify(map_.inputs, term / factors[0], modules="math")
+        amplitude = sympy.lambdify(map_.inputs, term / factors[0], modules="numpy")
         # cos is even: a negative frequency turns the phase round.
         found.setdefault((state, abs(w)), []).append((amplitude, shift if w > 0 else -shift))
     if len({state for state, _ in found}) < len(found):
@@ -346,7 +419,7 @@ def _turning(angle: Any, map_: Map) -> tuple[int, float, float] | None:
     import sympy
 
     state, w, phase = -1, 0.0, 0.0
-    for term in sympy.Add.make_args(sympy.expand_mul(angle)):
+    for term in sympy.Add.make_args(_expanded(angle)):
         coefficient, rest = term.as_independent(*map_.states, as_Add=False)
         if not coefficient.is_number or (rest != 1 and rest not in map_.states):
             return None
@@ -359,12 +432,29 @@ def _turning(angle: Any, map_: Map) -> tuple[int, float, float] | None:
     return (state, w, phase) if w else None
 
 
-def _terms(expression: Any) -> float:
-    """At most how many terms an expression has when expanded, without expanding it."""
+def _expanded(expression: Any) -> Any:
+    """Multiplied out, but for what is inside of functions."""
+    import sympy
+
     if expression.is_Add:
-        return sum(_terms(one) for one in expression.args)
+        return sympy.Add(*map(_expanded, expression.args))
+    found = sympy.expand_mul(sympy.expand_multinomial(expression, deep=False), deep=False)
+    return found if found == expression else _expanded(found)
+
+
+def _terms(expression: Any) -> float:
+    """At most how many terms an expression has when expanded, without expanding it.
+
+    Those of functions' arguments and of divisors count too.
+    """
+    if not expression.args:
+        return 1.0
     if expression.is_Mul:
-        return math.prod(_terms(one) for one in expression.args)
-    if expression.is_Pow and expression.exp.is_Integer and expression.exp > 0:
-        return _terms(expression.base) ** min(int(expression.exp), LARGEST_POWER)
-    return 1.0
+        found = math.prod(_terms(one) for one in expression.args)
+    elif expression.is_Pow and expression.exp.is_Integer:
+        found = _terms(expression.base) ** min(abs(int(expression.exp)), LARGEST_POWER)
+    elif expression.is_Pow:
+        found = _terms(expression.base)
+    else:
+        found = sum(_terms(one) for one in expression.args)
+    return min(found, MOST_TERMS + 1.0)  # no power of it overflows

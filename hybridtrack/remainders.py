@@ -43,16 +43,18 @@ class Remainder(NamedTuple):
             for wave in found or ():
                 v, (amplitude, phase) = wave.state, wave.phasor(u)
                 ends = (wave.frequency * side[:, v] + phase for side in (centre, low, high))
-                least, most = wave_range(*ends)
-                lower[:, i] += amplitude * least
-                upper[:, i] += amplitude * most
+                with np.errstate(all="ignore"):
+                    least, most = wave_range(*ends)
+                    lower[:, i] += amplitude * least
+                    upper[:, i] += amplitude * most
         general = [i for i, found in enumerate(self.waves) if found is None]
         if general:
             assert self.balls is not None
             with np.errstate(all="ignore"):
                 least, most = self.balls.enclose(centre, low, high, u)
             lower[:, general], upper[:, general] = least[:, general], most[:, general]
-        return lower, upper
+        # What is no number, as the amplitude log(u) at u = 0, bounds nothing.
+        return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
 
     def at_point(self, centre: Array, x: Array, u: Array) -> Array:
         """|(x - c)' H(x) (x - c)| (lanes, n) at a single point, as Otanez 2004, eq. 40."""
@@ -104,6 +106,16 @@ class Balls:
 
         arguments = (*map_.states, *map_.inputs)
         words = ball_functions()
+        # Derivatives of atan2 are smooth across its cut, where it jumps by 2 pi.
+        cuts = [
+            (i, angle)
+            for i, one in enumerate(map_.expressions)
+            for angle in sorted(one.atoms(sympy.atan2), key=str)
+            if angle.free_symbols & set(map_.states)
+        ]
+        self._cut = [i for i, _ in cuts]
+        sides = [side for _, angle in cuts for side in angle.args]
+        self._sides = sympy.lambdify(arguments, sides, modules=[words])
         self._shape = (len(map_.expressions), len(map_.states))
         self._jacobian = sympy.lambdify(arguments, list(map_.gradient), modules=[words])
         self._hessian = sympy.lambdify(arguments, list(map_.curvature), modules=[words])
@@ -142,6 +154,10 @@ class Balls:
             forms = [ends(mean_value), ends(lagrange / 2)]
             lower[i] = max(form[0] for form in forms)
             upper[i] = min(form[1] for form in forms)
+        sides = self._all(self._sides, (*X, *inputs), 2 * len(self._cut))
+        for i, y, x in zip(self._cut, sides[::2], sides[1::2], strict=True):
+            if not (y > 0 or y < 0 or x > 0):  # comparisons of balls hold for all their points
+                lower[i], upper[i] = -np.inf, np.inf
         return lower, upper
 
     @staticmethod

@@ -51,9 +51,11 @@ def set_tables(
     yield table
     yield ""
     yield Text(
-        "violated: the truth left the set; emptied: the noise broke its bounds; diverged: not "
-        "followed to the end; useless: no heading is excluded; error: (x-c)' S^-1 (x-c), 1 on the "
-        "boundary; bounds: medians over runs of the mean over time"
+        "violated: the truth left the set; emptied: a measurement left nothing of the set (noise "
+        "or remainder beyond what the filter believes); diverged: its set grew past `growth` times "
+        "its first width, or a value was lost; useless: no heading is excluded at some step; "
+        "error: (x-c)' S^-1 (x-c), 1 on the boundary; bounds: medians over runs of the mean over "
+        "time"
     )
     yield from map(Text, _of_noise(summary))
     yield from map(Text, _of_bounds(comparisons, manifest["compare_with"], found))

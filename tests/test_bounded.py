@@ -135,6 +135,14 @@ def test_the_adversary_never_cheats():
     assert opposed(aircraft(), {}, 16, steps=60).largest <= 1 + 1e-9  # asserts its draws are inside
 
 
+@pytest.mark.parametrize("contains_box", [False, True])
+def test_outside_is_what_leaves_the_filters_ellipsoid(contains_box):
+    """Corners of the box lie outside Q and R, and inside 3 Q and 2 R where those are believed."""
+    model = aircraft(contains_box)
+    runs = bounded.BoundedRuns(truth(model, "persistent_box"), lambda p: stream(1, 0, 0, p), 16, 16)
+    assert (runs.advance(50)[2] == (not contains_box)).all()
+
+
 def test_half_axes_of_measurement_noise_are_its_own():
     w = drawn("persistent_box", shape=R)
     np.testing.assert_allclose(np.abs(w), 0.09, rtol=1e-12)

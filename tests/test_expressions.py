@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -147,6 +148,53 @@ def test_what_is_refused_is_one_sentence_in_no_time(text, said):
     assert ";" in message  # what is wrong; what to do
     assert len(message) < 250
     assert time.process_time() - begin < 0.5
+
+
+KINKS = ["sqrt(x**2)", "sqrt((x + y)**2)*psi", "(x**2)**1.5", "cos(sqrt(cos(x)**2))"]
+
+
+@pytest.mark.parametrize("text", KINKS)
+def test_kinks_are_refused(text):
+    with pytest.raises(ex.ExpressionError, match=r"it has a kink .*; write it without"):
+        ex.parse(text, SYMBOLS)
+
+
+def test_what_is_unknown_is_refused_after_differentiation_too():
+    import sympy
+
+    x = SYMBOLS["x"]
+    for one, said in ((sympy.Abs(x), "a kink"), (sympy.gamma(x), "not known here")):
+        with pytest.raises(ex.ExpressionError, match=said) as caught:
+            ex.compiled([x, one], (x,), ())
+        assert caught.value.component == 1
+
+
+@pytest.mark.parametrize("text", ["sin(" * 58 + "x" + ")" * 58, "sin(x*" * 28 + "y" + ")" * 28])
+def test_derivatives_that_are_too_long_are_refused(text):
+    with pytest.raises(ex.ExpressionError, match="more than 5,000 operations; shorten it"):
+        system((text,))
+
+
+def test_no_expression_is_multiplied_out_at_length():
+    """In functions and in divisors neither; powers of powers overflow no float."""
+    inside = "(x + y + psi + 1)**20"
+    nested = f"((({inside} + 1)**20 + 1)**20 + 1)**20"
+    for text in (f"cos({inside}*{inside})", f"1/({inside} + 1)**20", f"x*cos({inside})", nested):
+        map_ = system((text,))
+        assert ex._terms(map_.expressions[0]) > ex.MOST_TERMS, text
+        assert ex.waves(map_) == (None,)
+    found = ex.waves(system(("2*(x + 3*(cos(psi) + 4*(y + 1)))", "(x + 1)**2 - x**2")))
+    assert [len(one) for one in found] == [1, 0]
+
+
+def test_no_warning_leaks_from_python_s_own_parser():
+    """Recorded: as errors they would be the parser's SyntaxErrors, and refused as such."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for text in ("1if x else y", "1or x", "'\\d'", "1in x"):
+            with pytest.raises(ex.ExpressionError):
+                ex.parse(text, SYMBOLS)
+    assert not caught
 
 
 def test_names_never_become_code(tmp_path, monkeypatch):

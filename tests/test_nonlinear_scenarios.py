@@ -48,6 +48,22 @@ MISTAKES = [
     ("x + T*(-v0 + v1*cos(psi))", "x + T*cos(pssi)", "'pssi' is not known; did you mean 'psi'"),
     ("x + T*(-v0 + v1*cos(psi))", "(" * 1000 + "x" + ")" * 1000, "nested deeper than"),
     ("x + T*(-v0 + v1*cos(psi))", "x + 1/y", "no finite value at the start"),
+    ("y + T*v1*sin(psi)", "y + sqrt(x**2)", "'y' is y + sqrt(x**2): it has a kink"),
+    (
+        "y + T*v1*sin(psi)",
+        f"y + {'sin(' * 58}x{')' * 58}",
+        "a derivative of it has more than 5,000 operations",
+    ),
+    (
+        "inputs: {v0: 0}\ndynamics:\n  x: x + T*(-v0",
+        f"inputs: {{v0: {[1] * 59 + [0]}}}\ndynamics:\n  x: x + T*(-log(v0)",
+        "where 'v0' is 0, an expression or a derivative of it has no finite value",
+    ),
+    (
+        "inputs: {v0: 0}\ndynamics:\n  x: x + T*(-v0 + v1",
+        f"inputs: {{v0: {[1] * 59 + [-2]}}}\ndynamics:\n  x: x + T*(-v0 + log(v0)",
+        "where 'v0' is -2, an expression",
+    ),
     ("x + T*(-v0 + v1*cos(psi))", "sqrt(x)", "no finite derivative at the start"),
     ("x + T*(-v0 + v1*cos(psi))", "log(x)", "no finite value at the start"),
     ("x + T*(-v0 + v1*cos(psi))", "[1]", "'x' of 'dynamics' is a list|'x' is a list"),
@@ -196,6 +212,10 @@ def test_the_printed_output_says_what_came_of_the_sets(finished, capsys):
     assert "sets: runs that" in said
     assert "bounds of RESET against ESMF's (medians): x +" in said
     assert "leaves its ellipsoid" not in said
+    told = " ".join(said.split())
+    assert "emptied: a measurement left nothing of the set (noise or remainder beyond" in told
+    assert "diverged: its set grew past `growth` times its first width, or a value was" in told
+    assert "useless: no heading is excluded at some step" in told
     assert json.dumps(tables.as_json(folder)["sets"][0])
 
 
@@ -207,6 +227,15 @@ def test_noise_that_leaves_its_ellipsoid_is_told(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "the process noise leaves its ellipsoid in 3" in said
     assert "the measurement noise leaves its ellipsoid in 1" in said
+
+
+def test_noise_in_the_ellipsoid_that_filters_believe_in_is_inside(tmp_path, capsys):
+    from rich.console import Console
+
+    chosen = ("noise.kind=persistent_box", "noise.contains_box=true")
+    _, folder = run(tmp_path, settings_=chosen)
+    tables.show(folder, Console(width=200))
+    assert "leaves its ellipsoid" not in capsys.readouterr().out
 
 
 def test_an_adversary_plays_against_one_estimator(tmp_path):

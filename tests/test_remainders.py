@@ -124,3 +124,34 @@ def test_a_wave_of_an_input_has_its_amplitude():
         whole.enclose(centre, centre - 1, centre + 1, np.array([v]))[1] for v in (1.0, 3.0)
     )
     np.testing.assert_allclose(three, 3 * one, rtol=1e-9)
+
+
+@pytest.mark.parametrize("bearing", ["atan2(y, x)", "psi + 2*atan2(y, x)", "cos(psi)*atan2(y, x)"])
+def test_across_the_cut_of_atan2_the_remainder_is_unbounded(bearing):
+    """Its derivatives are smooth there and it jumps by 2 pi; beside it all is as ever."""
+    whole = remainders.remainder(system((bearing, "sqrt(x**2 + y**2)")))
+    centre = np.array([[-3.0, 0.2, 0.1]])
+    least, most = whole.enclose(centre, centre - 0.3, centre + 0.3, U)
+    assert (least[0, 0], most[0, 0]) == (-np.inf, np.inf)
+    assert np.isfinite([least[0, 1], most[0, 1]]).all()
+    for beside in ([-3.0, 0.4, 0.1], [-3.0, -0.4, 0.1], [3.0, 0.4, 0.1]):
+        c = np.array([beside])
+        assert np.isfinite(whole.enclose(c, c - 0.3, c + 0.3, U)).all()
+    # The hull with the centre counts: the box alone lies on one side.
+    low, high = np.array([[-3.0, -0.3, 0.1]]), np.array([[-2.9, -0.1, 0.1]])
+    assert whole.enclose(centre, low, high, U)[1][0, 0] == np.inf
+
+
+@pytest.mark.filterwarnings("error")
+def test_inputs_without_a_value_leave_a_wave_unbounded():
+    """The logarithm of 0 is no crash: what isn't known bounds nothing."""
+    from hybridtrack import expressions as ex
+
+    x, u = ex.symbols(NAMES, "state"), ex.symbols(("v",), "input")
+    names = dict(zip((*NAMES, "v"), (*x, *u), strict=True))
+    whole = remainders.remainder(ex.compiled([ex.parse("x + log(v)*cos(psi)", names)], x, u))
+    assert whole.waves[0] is not None
+    box = np.array([[0.0, 0.0, 0.4]])
+    for v in (0.0, -1.0, np.nan):
+        least, most = whole.enclose(box, box - 1, box + 1, np.array([v]))
+        assert (least[0, 0], most[0, 0]) == (-np.inf, np.inf)

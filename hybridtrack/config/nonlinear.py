@@ -22,6 +22,8 @@ from hybridtrack.expressions import (
     ExpressionError,
     Map,
     compiled,
+    constants_of_states,
+    not_finite,
     number,
     parse,
     symbols,
@@ -49,6 +51,7 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
         )
     model = _model(form, len(times_s) - 1, document)
     truth = _truth(form, model, document)
+    _check_inputs(model, tuple(form.inputs), document)
     _check_start(model, truth.start, document)
     case = Case(form.name, times_s, truth)
     nothing = ModeBank((), model.state_names, 1, None, None, np.zeros(0))
@@ -174,7 +177,12 @@ def _map(
         except ExpressionError as error:
             said = f"'{shown(name)}' is {shown(written)}: {error}"
             raise document.error((kind, name), said) from None
-    return compiled(found, x, u)
+    try:
+        return compiled(found, x, u)
+    except ExpressionError as error:
+        name, text = list(texts.items())[error.component]
+        said = f"'{shown(name)}' is {shown(str(text))}: {error}"
+        raise document.error((kind, name), said) from None
 
 
 def _check_start(model: NonlinearModel, start: Array, document: Document) -> None:
@@ -197,6 +205,24 @@ def _check_start(model: NonlinearModel, start: Array, document: Document) -> Non
                         f"'{shown(name)}' has no finite {what} at the start of the truth (a "
                         "division by zero?); change it, or 'start'",
                     )
+
+
+def _check_inputs(model: NonlinearModel, names: tuple[str, ...], document: Document) -> None:
+    """What the maps make of inputs alone has a finite value at all of their values."""
+    rows = np.unique(model.inputs, axis=0)
+    for map_ in (model.dynamics, model.measurement):
+        for part in constants_of_states(map_):
+            lost = not_finite(part, map_, rows)
+            if not lost.any():
+                continue
+            row = rows[np.flatnonzero(lost)[0]]
+            held = [i for i, symbol in enumerate(map_.inputs) if symbol in part.free_symbols]
+            values = " and ".join(f"'{shown(names[i])}' is {row[i]:g}" for i in held)
+            raise document.error(
+                ("inputs", names[held[0]]),
+                f"where {values}, an expression or a derivative of it has no finite value (a "
+                "division by zero, or a root or logarithm of a negative number?); change it",
+            )
 
 
 def _inputs(form: NonlinearForm, n_steps: int, document: Document) -> Array:
