@@ -33,6 +33,7 @@ ENCLOSED = 128  # intervals that fourth derivatives are enclosed over
 SIGNS = 4096  # cells that a second derivative's sign is looked up at
 ROUNDING = 1e-12  # of its largest value: what has no sign
 HALVINGS = 60
+BISECTIONS = 50  # of a place: to 1e-15 of what is left of the range
 RESTARTS, GENERATIONS, POPULATION = 3, 80, 60  # of differential evolution
 SEARCHED = 401  # places that it judges candidates at
 CHECKED = 20_001  # places that an error is looked up at
@@ -274,14 +275,13 @@ def _farthest(error: Callable[[float], float], start: float, high: float, level:
 
 def _halved(error: Callable[[float], float], served: float, unserved: float, level: float) -> float:
     """By bisection, which an error that rounding makes rough doesn't hold up."""
-    while True:
+    for _ in range(BISECTIONS):
         middle = 0.5 * (served + unserved)
-        if not served < middle < unserved:
-            return served
         if error(middle) <= level:
             served = middle
         else:
             unserved = middle
+    return served
 
 
 def _place_exact(
