@@ -306,4 +306,4 @@ def test_places_have_the_digits_of_their_range():
     assert place(0.7853981, 1.57) == "0.785"
     assert place(-1e-9, 4.0) == "0.000"
     assert place(2.63e-6, 1e-5) == "2.63e-06"
-    assert place(12345.6, 2e5) == "1.235e+04"
+    assert place(12345.6, 2e5) == "1.23e+04"
