@@ -458,12 +458,12 @@ def test_where_the_curvature_changes_its_sign_the_error_itself_is_searched():
 
 
 def test_an_error_that_rounding_makes_rough_is_covered():
-    from hybridtrack.analyses._placement import _walk
+    from hybridtrack.analyses._placement import _walk, smallest_level
 
     function = one_state(X + sympy.Float(0.1) * sympy.sin(X))
     bound = majorant(function, -2.0, 2.0)
-    for level in np.geomspace(1e-17, 1.0, 40):
-        _walk(bound, -2.0, 2.0, level, 3)
+    for count in range(1, 7):
+        smallest_level(lambda q, n=count: _walk(bound, -2.0, 2.0, q, n), 0.5)
 
 
 def test_without_process_noise_nothing_crashes():
