@@ -14,7 +14,7 @@ didn't diverge, leaves nothing to judge.
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from hybridtrack.statistics import Estimate, Paired
 
@@ -28,10 +28,6 @@ DIRECTION = "direction only"
 NOT_REPRODUCED = "not reproduced"
 UNDECIDED = "undecided: too few runs"
 NO_DATA = "undecided: no data"
-
-Verdict = Literal[
-    "reproduced", "reproduced with stated assumptions", "direction only", "not reproduced"
-]
 
 
 class Claim(NamedTuple):

@@ -28,7 +28,6 @@ NonNegative = Annotated[float, Field(ge=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Matrix = list[list[float]]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
-PerAxis = list[NonNegative]
 
 
 class Form(BaseModel):

@@ -12,9 +12,7 @@ from hybridtrack import experiment as experiments
 from hybridtrack.analyses import Analysis, Findings, Measured, Table
 from hybridtrack.config import Experiment, dump
 from hybridtrack.errors import UserError
-from hybridtrack.verdicts import UNDECIDED, AnalysisClaim, Interval, judge_interval
-
-K = 3.0  # standard errors that a figure may be off by chance
+from hybridtrack.verdicts import UNDECIDED, AnalysisClaim, Interval, K, judge_interval
 
 
 def digest(experiment: Experiment, analysis: Analysis) -> str:
