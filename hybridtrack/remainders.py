@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridtrack.expressions import Map, Wave, waves
+from hybridtrack.maps import Map, Wave, waves
 from hybridtrack.models import Array
 
 ROUNDING = 16 * np.finfo(np.float64).eps  # of a sum of five terms, each right to two last bits

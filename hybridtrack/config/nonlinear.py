@@ -20,14 +20,10 @@ from hybridtrack.expressions import (
     FUNCTIONS,
     KNOWN_NUMBERS,
     ExpressionError,
-    Map,
-    compiled,
-    constants_of_states,
-    not_finite,
     number,
     parse,
-    symbols,
 )
+from hybridtrack.maps import Map, compiled, constants_of_states, not_finite, symbols
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.nonlinear import NonlinearModel
 from hybridtrack.remainders import remainder
