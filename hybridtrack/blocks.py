@@ -2,7 +2,7 @@
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -74,6 +74,12 @@ def _prepared_for_one(
 ) -> Any:
     """An estimator for such a step, which blocks have in common too."""
     return estimator.one.prepare(settings, _model_of_one(bank, step_s, covariance, even))
+
+
+def _in_metres(names: tuple[str, ...], units: Mapping[str, str]) -> tuple[str, ...]:
+    """Names of positions and velocities as scores know them; '' for what has another unit."""
+    scored = {"": "m", "v": "m/s"}
+    return tuple(n if units.get(n) == scored.get(n[:-1]) else "" for n in names)
 
 
 def _one_step(running: SetsAtWork, prepared: Any) -> Callable[[Array], tuple[Array, Array]]:
@@ -238,6 +244,8 @@ class _Block:
         experiment, initial = self._experiment, self._experiment.initial
         model = experiment.nonlinear
         assert model is not None
+        if self._task.tracks:
+            self._tracks.noise_free(model.course(truth.start, self._n_steps)[1:])
         mean = np.repeat(initial.mean[:, np.newaxis], self._lanes, axis=1)
         if initial.follows_truth:
             mean = self._simulation.initial_state.copy()
@@ -275,7 +283,11 @@ class _Block:
     def _advance(self, span: slice, scans: Scans) -> None:
         """Filter and score scans that none of the filters started from."""
         held = self._windows(span, scans.truth) if self._held is None else self._held[span]
-        self._score(span, RAW, scans, held, as_measured(scans.measurements))
+        measured = as_measured(scans.measurements)
+        lost = self._lost(scans.truth)
+        if lost is not None:
+            self._give_up(span, RAW, measured, lost)
+        self._score(span, RAW, scans, held, measured)
         if self._noise is not None:
             self._noise.add(self._simulation.noise_outside, held)
         prepared = self._prepared(span)
@@ -285,7 +297,7 @@ class _Block:
             estimates = running.advance(
                 prepared[label], scans.measurements, covariance=covariance, known_modes=told
             )
-            self._note_status(span, label, estimates)
+            self._note_status(span, label, estimates, lost)
             self._score(span, label, scans, held, estimates)
             if self._experiment.nonlinear is not None:
                 self._score_sets(span, label, cast(SetsAtWork, running), scans, held, estimates)
@@ -332,10 +344,12 @@ class _Block:
     def _begin_tally(self, label: str, estimates: Estimates) -> Tally:
         experiment, running = self._experiment, self._running.get(label)
         measured = tuple("xyz"[: estimates.mean.shape[1]])
+        states = self._simulation.state_names
         if experiment.nonlinear is not None:
-            measured = experiment.nonlinear.measurement_names
+            measured = _in_metres(experiment.nonlinear.measurement_names, experiment.units)
+            states = _in_metres(states, experiment.units)
         names = Names(
-            self._simulation.state_names,
+            states,
             experiment.truth_modes,
             running.state_names if running else measured,
             running.mode_names if running else (),
@@ -371,14 +385,29 @@ class _Block:
         moments.mean[span] = share
         moments.squares[span] = runs * share * (1.0 - share)
 
-    def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
-        """Note the step at which a run diverges; from there on its estimates are NaN."""
-        if all_below(estimates.mean, DIVERGED):
+    def _lost(self, truth: TruthSpan) -> NDArray[np.bool_] | None:
+        """Where (n_steps, lanes) a nonlinear truth has no value any more; None if nowhere."""
+        if self._noise is None or all_below(truth.state, DIVERGED):
+            return None
+        beyond: NDArray[np.bool_] = ~(np.abs(truth.state).max(axis=1) < DIVERGED)
+        return beyond
+
+    def _note_status(
+        self, span: slice, label: str, estimates: Estimates, lost: NDArray[np.bool_] | None
+    ) -> None:
+        """Note the step at which a run diverges, or its truth is lost."""
+        if lost is None and all_below(estimates.mean, DIVERGED):
             return
+        beyond = ~(np.abs(estimates.mean).max(axis=1) < DIVERGED)
+        self._give_up(span, label, estimates, beyond if lost is None else beyond | lost)
+
+    def _give_up(
+        self, span: slice, label: str, estimates: Estimates, beyond: NDArray[np.bool_]
+    ) -> None:
+        """From its first step beyond on (n_steps, lanes) a run's estimates are NaN."""
         status = self._status[label]
-        sound = np.abs(estimates.mean).max(axis=1) < DIVERGED
-        for b in np.flatnonzero(~sound.all(axis=0)):
-            first = int(np.argmin(sound[:, b]))
+        for b in np.flatnonzero(beyond.any(axis=0)):
+            first = int(np.argmax(beyond[:, b]))
             if b < self._task.runs and status[b] == 0:
                 status[b] = span.start + first + 1
             for array in estimates:

@@ -272,6 +272,7 @@ def _manifest(experiment: Experiment) -> dict[str, Any]:
         "windows": [window.name for window in experiment.windows],
         "compare_with": experiment.compare_with,
         "error": experiment.error,
+        "states": experiment.states,
         "cases": len(experiment.cases),
         "versions": {
             "hybridtrack": __version__,

@@ -21,6 +21,7 @@ from hybridtrack.statistics import (
 
 RAW = "raw"
 TRUTH = "truth"
+NOISE_FREE = "noise_free"  # the truth's course, were there no noise
 
 Series = tuple[str, str]  # estimator, quantity
 Cell = tuple[str, str, str]  # estimator, window, quantity

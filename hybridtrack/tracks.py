@@ -6,7 +6,7 @@ import numpy as np
 
 from hybridtrack.config import Experiment
 from hybridtrack.estimators import AtWork, Estimates, SetsAtWork
-from hybridtrack.groups import TRUTH, BlockTask, Track
+from hybridtrack.groups import NOISE_FREE, TRUTH, BlockTask, Track
 from hybridtrack.models import Array
 from hybridtrack.simulation import Scans
 
@@ -23,7 +23,12 @@ class TrackKeeper:
 
     def tracks(self) -> list[Track]:
         """Truth and measurements first, then estimators in the scenario's order."""
-        order = [TRUTH, MEASUREMENT, *(chosen.label for chosen in self._experiment.estimators)]
+        order = [
+            TRUTH,
+            NOISE_FREE,
+            MEASUREMENT,
+            *(chosen.label for chosen in self._experiment.estimators),
+        ]
         kept = sorted(self._kept.items(), key=lambda item: order.index(item[0][1]))
         return [Track(*key, values) for key, values in kept]
 
@@ -39,6 +44,13 @@ class TrackKeeper:
         for m in range(scans.measurements.shape[1]):
             name = "xy"[m] if model is None else model.measurement_names[m]
             self._keep(span, MEASUREMENT, name, scans.measurements[:, m])
+
+    def noise_free(self, course: Array) -> None:
+        """The states (n_steps, n_x) of a nonlinear truth, were there no noise."""
+        model = self._experiment.nonlinear
+        assert model is not None
+        for e, name in enumerate(model.state_names):
+            self._keep(slice(0, self._n_steps), NOISE_FREE, name, course[:, e, np.newaxis])
 
     def estimates(self, span: slice, label: str, running: AtWork, estimates: Estimates) -> None:
         """What an estimator says of a span, with what it tells beside its means."""

@@ -155,3 +155,12 @@ def test_inputs_without_a_value_leave_a_wave_unbounded():
     for v in (0.0, -1.0, np.nan):
         least, most = whole.enclose(box, box - 1, box + 1, np.array([v]))
         assert (least[0, 0], most[0, 0]) == (-np.inf, np.inf)
+
+
+def test_even_powers_and_products_don_t_begin_below_their_range():
+    """Of x^4 about 0 nothing is below 0; by middles and radii it would begin at -48."""
+    low, high = -np.ones((1, 3)), 2 * np.ones((1, 3))
+    found = remainders.remainder(system(("x**4", "y", "psi")))
+    least, most = found.enclose(np.zeros((1, 3)), low, high, np.zeros(0))
+    assert -1e-5 < least[0, 0] <= 0.0
+    assert 16.0 <= most[0, 0] < 64.001
