@@ -118,14 +118,14 @@ def sets(folder: Path) -> str:
     """What came of the sets of a run's estimators."""
     rows = results.read_rows(folder, "sets")
     found = {(row["estimator"], row["figure"]): row for row in rows}
-    bounds = [f for f in dict.fromkeys(row["figure"] for row in rows) if f.startswith("median")]
     heads = [heading for _, heading in tables_of_sets.OUTCOMES] + ["largest error"]
-    heads += [f"bound on {figure.partition(':')[2]}" for figure in bounds]
+    units = results.require_complete(folder)["states"]
+    heads += [f"bound on {state}, {unit}" for state, unit in units.items()]
     lines = [f"| | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
     for label in dict.fromkeys(row["estimator"] for row in rows):
         cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables_of_sets.OUTCOMES]
         cells.append(tables_of_sets.largest(found[label, "largest_normalised_error"]["value"]))
-        medians = [found[label, figure] for figure in bounds]
+        medians = [found[label, tables_of_sets.MEDIAN_BOUND + state] for state in units]
         cells += [typesetting.figure(row["value"], row["standard_error"]) for row in medians]
         lines.append(f"| `{label}` | {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
