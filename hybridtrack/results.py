@@ -49,6 +49,7 @@ FINISHED: dict[str, type | tuple[type, ...]] = {  # what a finished run's manife
     "compare_with": (str, type(None)),
     "error": str,
     "diverged": dict,
+    "states": dict,
 }
 DAMAGE = (
     OSError,

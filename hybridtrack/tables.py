@@ -60,7 +60,7 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     runs, cases = manifest["runs"], manifest["cases"]
     over = f" in each of {cases} cases" if cases > 1 else ""
     yield Text(f"{manifest['title']}: {counted(runs, 'run')}{over}, seed {manifest['seed']}\n")
-    error, units = manifest["error"], manifest.get("states", {})
+    error, units = manifest["error"], manifest["states"]
     of_states = [(f"{error}:{s}", heading(s, u, error)) for s, u in units.items()]
     shown = (*ERRORS[error], *of_states, *MODES)
     yield _summary("estimator", summary, ["raw", *manifest["estimators"]], shown)

@@ -54,7 +54,7 @@ def set_tables(
         "step; "
         "error: (x-c)' S^-1 (x-c), 1 on the boundary"
     )
-    units = manifest.get("states", {})
+    units = manifest["states"]
     bounds = {
         label: [
             estimate(row["value"], row["standard_error"])

@@ -29,6 +29,7 @@ def folder(tmp_path):
         "windows": ["all", "turn", "nowhere"],
         "compare_with": None,
         "error": "rmse",
+        "states": {},
     }
     (tmp_path / results.MANIFEST).write_text(json.dumps(manifest))
     rows = [
