@@ -167,9 +167,9 @@ def test_the_run_is_the_one_that_run_makes(finished, tmp_path):
         ),
     ],
 )
-def test_bad_input_is_one_sentence(arguments, words, finished):
+def test_bad_input_is_one_sentence(arguments, words, finished, said):
     cwd, _ = finished
-    done = hybridtrack(*arguments, "--runs", "20", "--quiet", cwd=cwd)
+    done = said(*arguments, "--runs", "20", "--quiet", cwd=cwd)
     sentence = one_sentence(done)
     for word in words:
         assert word in sentence

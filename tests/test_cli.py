@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real processes, real folders."""
+"""The command line as a user meets it: real folders, and real processes where they matter."""
 
 import ast
 import json
@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
+
+from hybridtrack import cli
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 HEAVY = {"numpy", "numba", "pandas", "matplotlib", "pydantic", "scipy", "pyarrow", "yaml"}
@@ -65,12 +67,10 @@ def test_help_imports_nothing_heavy(arguments, allowed):
     assert set(ast.literal_eval(done.stdout.splitlines()[-1])) <= allowed
 
 
-def test_every_command_has_help_with_examples(tmp_path):
-    from hybridtrack.cli import app
-
-    for command in app.registered_commands:
+def test_every_command_has_help_with_examples(tmp_path, said):
+    for command in cli.app.registered_commands:
         name = command.name or command.callback.__name__
-        done = hybridtrack(name, "--help", cwd=tmp_path)
+        done = said(name, "--help", cwd=tmp_path)
         assert done.returncode == 0
         assert f"  hybridtrack {name}" in done.stdout.partition("Examples:")[2]
         assert max(map(len, done.stdout.splitlines())) <= 80
@@ -219,17 +219,24 @@ def test_out_names_the_folder_and_other_runs_are_safe_in_it(tmp_path):
         (["run", "rmimm_fig5", "--out", "/dev/null/x", "--runs", "2", "-q"], ["/dev/null/x"]),
     ],
 )
-def test_bad_input_is_one_sentence(tmp_path, arguments, words):
-    sentence = one_sentence(hybridtrack(*arguments, cwd=tmp_path))
+def test_bad_input_is_one_sentence(tmp_path, said, arguments, words):
+    sentence = one_sentence(said(*arguments, cwd=tmp_path))
     for word in words:
         assert word in sentence
+
+
+def test_a_process_says_the_same_as_its_command_here(tmp_path, said):
+    for arguments in (["run", "rmimm_fig6"], ["plot", "."], ["list", "motions"], ["schema"]):
+        there, here = hybridtrack(*arguments, cwd=tmp_path), said(*arguments, cwd=tmp_path)
+        assert (here.returncode, here.stdout) == (there.returncode, there.stdout)
+        assert here.stderr == there.stderr
 
 
 @pytest.mark.parametrize(
     "arguments", [["fly"], ["run"], ["run", "rmimm_fig5", "--runs", "many"], ["run", "--what"]]
 )
-def test_wrong_usage_exits_with_2_and_no_traceback(tmp_path, arguments):
-    done = hybridtrack(*arguments, cwd=tmp_path)
+def test_wrong_usage_exits_with_2_and_no_traceback(tmp_path, said, arguments):
+    done = said(*arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert "Usage:" in done.stderr
