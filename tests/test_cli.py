@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridtrack import cli
+from hybridtrack import cli, progress
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 HEAVY = {"numpy", "numba", "pandas", "matplotlib", "pydantic", "scipy", "pyarrow", "yaml"}
@@ -387,10 +387,14 @@ def test_an_interrupt_tells_what_is_kept(tmp_path):
     assert "finished shards are kept in" in _what_is_kept(tmp_path)
 
 
-def start_long_run(cwd, runs="2000000"):
+OURS = ("-m", "hybridtrack")
+
+
+def start_long_run(cwd, program=OURS):
     """A run of many minutes, once it has finished its first shard."""
+    arguments = ["run", "rmimm_fig5", "--runs", "2000000", "--out", "long"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "hybridtrack", "run", "rmimm_fig5", "--runs", runs, "--out", "long"],
+        [sys.executable, *program, *arguments],
         cwd=cwd,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -424,12 +428,17 @@ def test_interrupt_is_one_line_and_130_and_keeps_what_is_finished(tmp_path):
 
 
 def test_plain_progress_without_a_terminal(tmp_path):
-    process = start_long_run(tmp_path)
-    time.sleep(6)  # a plain line comes every five seconds
+    """A plain line every five seconds, here every one."""
+    assert progress.QUIET_S == 5.0
+    begun = time.monotonic()
+    code = "from hybridtrack import cli, progress; progress.QUIET_S = 1.0; cli.main()"
+    process = start_long_run(tmp_path, ("-c", code))
+    time.sleep(2)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
-    assert "of 2,000,000 runs" in err
-    assert "s left" in err
+    lines = [line for line in err.splitlines() if "of 2,000,000 runs, " in line]
+    assert all(line.endswith(" s left") for line in lines)
+    assert 1 <= len(lines) <= time.monotonic() - begun
     assert "\x1b" not in err
 
 
