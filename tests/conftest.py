@@ -12,8 +12,8 @@ from hybridtrack import cli, console
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-# As every command begins, and before numpy comes: with BLAS's own threads a Riccati equation of
-# four states takes seven times as long, and the analyses solve thousands.
+# As every command begins, and before numpy comes: where other processes are at work too, BLAS's
+# own threads take fifty times as long for a Riccati equation of four states.
 console.spare_time()
 
 # A shell that starts us in the background ignores Ctrl-C, and our children would inherit that.
