@@ -427,6 +427,8 @@ def test_telling_one_from_the_other_is_telling_the_other_from_one(seed):
 
 @settings(max_examples=15, deadline=None)
 @given(SEEDS)
+@example(896)  # 2 scans, or 3 where outputs in their own units are not made alike
+@example(5990)
 def test_coordinates_of_states_and_units_of_outputs_do_not_matter(seed):
     rng = np.random.default_rng(seed)
     T = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
