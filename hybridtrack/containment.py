@@ -28,6 +28,12 @@ FLAGS = {
     "useless_share": Metric(
         "useless", False, "less", "share of runs in which the bound on an angle exceeds pi"
     ),
+    "unused_share": Metric(
+        "unused",
+        False,
+        "less",
+        "share of the components measured that say nothing: their remainder has no bound",
+    ),
     "largest_normalised_error": Metric(
         "largest_error", False, "less", "mean over runs of the largest (x-c)' Sigma^-1 (x-c)"
     ),
@@ -102,8 +108,7 @@ class SetTally:
             name: np.zeros((n_w, runs), dtype=np.bool_)
             for name in ("violated", "emptied", "useless")
         }
-        self._largest = np.zeros((n_w, runs))
-        self._switches = np.zeros((n_w, runs))
+        self._largest, self._switches, self._unused = np.zeros((3, n_w, runs))
         self._bounds, self._squares = np.zeros((2, n_w, n_x, runs))
         self._numbers = np.zeros((n_w, runs))
         self._first_s = np.full((n_w, n_p, runs), np.inf)
@@ -140,6 +145,7 @@ class SetTally:
             )
             self._switches[w] += (switched & inside).sum(axis=0)
             self._numbers[w] += inside.sum(axis=0)
+            self._unused[w] += np.where(inside, sets.unused[:, :runs], 0.0).sum(axis=0)
             here = inside[..., np.newaxis]
             self._bounds[w] += np.where(here, bound, 0.0).sum(axis=0).T
             self._squares[w] += np.where(here, error**2, 0.0).sum(axis=0).T
@@ -181,6 +187,7 @@ class SetTally:
             for name, flag in self._flags.items():
                 yield (window, name), (flag[w].astype(np.float64), once)
             yield (window, "largest_error"), (self._largest[w], once)
+            yield (window, "unused"), (self._unused[w], self._numbers[w])
             for e, state in enumerate(self._names.states):
                 yield (window, f"bound:{state}"), (self._bounds[w, e], self._numbers[w])
                 squares = (self._squares[w, e], self._numbers[w])

@@ -37,6 +37,8 @@ def parse(text: str, names: Mapping[str, Any]) -> Any:
 
     Raises ExpressionError with one sentence.
     """
+    if not text.strip():
+        raise ExpressionError("it is empty; write it as x + T*v*cos(psi)")
     if _brackets(text) > DEEPEST:
         raise ExpressionError(f"it is nested deeper than {DEEPEST} levels; flatten it")
     if len(text) > LONGEST:
@@ -177,7 +179,9 @@ class _Reader:
     def _operation(self, node: ast.BinOp, depth: int) -> Any:
         if isinstance(node.op, ast.BitXor):
             raise ExpressionError("it holds ^; write a power as x**2")
-        left = self.read(node.left, depth + 1)
+        # a long sum is deep in Python's tree and flat for whoever wrote it
+        chained = isinstance(node.left, ast.BinOp)
+        left = self.read(node.left, depth if chained else depth + 1)
         right = self.read(node.right, depth + 1)
         match node.op:
             case ast.Add():

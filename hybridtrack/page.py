@@ -72,7 +72,7 @@ class RunInformation(NamedTuple):
     def label(self, state: str) -> str:
         """A state with its unit, for an axis."""
         unit = (self.units or {}).get(state)
-        return f"{state} ({unit})" if unit else state
+        return f"{state} ({plain(unit, 60)})" if unit else state
 
 
 class Look(NamedTuple):

@@ -89,8 +89,9 @@ def wave_range(centre: Array, low: Array, high: Array) -> Enclosed:
         t = np.stack(places)
         g = np.cos(t) - cosine + sine * (t - centre)
         size = 2.0 + np.abs(t).max(axis=0) + np.abs(centre)
-        # A place is off by a few last bits, and g is flat there: that is less than this.
-        slack = ROUNDING * size
+        # A place is off by a few last bits, and g is flat there; c is, and g's slope by c is up to
+        # |t - c|: that is less than this.
+        slack = ROUNDING * size * (1.0 + np.abs(t - centre).max(axis=0))
         sound = np.isfinite(size)
     least = np.where(sound, g.min(axis=0) - slack, -np.inf)
     most = np.where(sound, g.max(axis=0) + slack, np.inf)
@@ -115,6 +116,8 @@ class Balls:
         self._cut = [i for i, _ in cuts]
         sides = [side for _, angle in cuts for side in angle.args]
         self._sides = over_balls(arguments, sides)
+        # Of atan(tan(x)) every derivative is smooth, and the value jumps at the poles of tan.
+        self._value = over_balls(arguments, map_.expressions)
         self._shape = (len(map_.expressions), len(map_.states))
         self._jacobian = over_balls(arguments, map_.gradient)
         self._hessian = over_balls(arguments, map_.curvature)
@@ -154,10 +157,13 @@ class Balls:
             forms = [ends(mean_value), ends(lagrange / 2)]
             lower[i] = max(form[0] for form in forms)
             upper[i] = min(form[1] for form in forms)
+        values = self._all(self._value, (*X, *inputs), n)
+        jumps = [i for i, value in enumerate(values) if not value.is_finite()]
         sides = self._all(self._sides, (*X, *inputs), 2 * len(self._cut))
         for i, y, x in zip(self._cut, sides[::2], sides[1::2], strict=True):
             if not (y > 0 or y < 0 or x > 0):  # comparisons of balls hold for all their points
-                lower[i], upper[i] = -np.inf, np.inf
+                jumps.append(i)
+        lower[jumps], upper[jumps] = -np.inf, np.inf
         return lower, upper
 
     @staticmethod

@@ -59,13 +59,20 @@ def draw_sets(
         time, truth = run["truth", state]
         ax.axhline(0.0, color=TRUTH_COLOUR, linewidth=1.3, label="truth")
         reach: dict[str, Array] = {}
+        ends: dict[str, list[float]] = {}
         for name in names:
             off, bound = run[name, state][1] - truth, run[name, f"bound:{state}"][1]
+            if not np.isfinite(off + bound).any():  # diverged at once
+                continue
             plot_line(ax, time, off + bound, looks[name])
             plot_line(ax, time, off - bound, looks[name])
             reach[name] = np.abs(off) + bound
-        leaving |= dict.fromkeys(f"{name} ({state})" for name in _frame(ax, reach))
-        ax.set_ylim(-ax.get_ylim()[1], ax.get_ylim()[1])
+            ends[name] = [float(np.nanmin(off - bound)), float(np.nanmax(off + bound))]
+        gone = _frame(ax, reach)
+        leaving |= dict.fromkeys(f"{name} ({state})" for name in gone)
+        top = ax.get_ylim()[1]
+        seen = [end for name in ends if name not in gone for end in ends[name]] or [-top, top]
+        ax.set_ylim(1.05 * min(*seen, 0.0), 1.05 * max(*seen, 0.0))
         ax.set_ylabel(f"{information.label(state)}\nless the truth")
     axes[-1].set_xlabel("time (s)")
     number = int(np.asarray(tracks["run"]).min())

@@ -67,6 +67,7 @@ def set_tables(
     yield _table("bounds (half-widths)", headings, bounds)
     yield ""
     yield Text("bounds: medians over runs of the mean over time; inf: half of the runs diverged")
+    yield from map(Text, _unused(summary))
     yield from map(Text, _of_noise(summary))
     yield from map(Text, _of_bounds(comparisons, manifest["compare_with"], found))
 
@@ -85,6 +86,17 @@ def _table(first: str, headings: list[str], cells: Mapping[str, list[str]]) -> T
 def largest(error: float) -> str:
     """A largest normalised error; how far beyond all measure it is tells of rounding alone."""
     return f"{error:.3g}" if error < MEANINGLESS else f"> {MEANINGLESS:,.0f}"
+
+
+def _unused(summary: Rows) -> Iterator[str]:
+    """Which filters can't use all that is measured."""
+    for row in summary:
+        if (row["metric"], row["window"]) == ("unused_share", "all") and row["value"] > 0:
+            share = estimate(100 * row["value"], 100 * row["standard_error"])
+            yield (
+                f"{row['estimator']} leaves out {share} % of what is measured: the remainder has "
+                "no bound there (a pole, or an angle's cut)"
+            )
 
 
 def _of_noise(summary: Rows) -> Iterator[str]:

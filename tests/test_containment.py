@@ -31,7 +31,9 @@ def case():
     chosen = generator.integers(0, 3, (STEPS, LANES))
     chosen[:, 1] = np.repeat([0, 1, 2], 10)
     points = generator.uniform(1, 2, (STEPS, 3, LANES))
-    sets = Sets(shape, chosen, empty, points, np.repeat(points[:, :, None], 2, axis=2))
+    unused = generator.choice([0.0, 0.5], (STEPS, LANES))
+    by_point = np.repeat(points[:, :, None], 2, axis=2)
+    sets = Sets(shape, chosen, empty, points, by_point, unused)
     held = np.ones((STEPS, 2, 1), dtype=bool)
     held[:15, 1] = False
     return truth, mean, sets, held
@@ -49,7 +51,9 @@ def tallied(case, cuts=(0, STEPS)):
 def counted(case, b, first):
     """One run from step `first` on, by plain loops."""
     truth, mean, sets, _ = case
-    found = dict.fromkeys(("violated", "emptied", "useless", "largest", "switched", "number"), 0)
+    names = ("violated", "emptied", "useless", "largest", "switched", "number", "unused")
+    found = dict.fromkeys(names, 0)
+    squares = np.zeros(2)
     bound, when = np.zeros(2), {}
     for k in range(first, STEPS):
         if np.isnan(mean[k, :, b]).any():
@@ -62,18 +66,20 @@ def counted(case, b, first):
         found["largest"] = max(found["largest"], d)
         found["number"] += 1
         found["switched"] += int(k > 0 and sets.chosen[k, b] != sets.chosen[k - 1, b])
+        found["unused"] += sets.unused[k, b]
+        squares += e**2
         bound += np.sqrt(np.diag(S))
         when.setdefault(int(sets.chosen[k, b]), TIMES_S[k])
     order = [when.get(i, np.inf) for i in range(3)]
     found["in_order"] = int(order[0] < order[1] < order[2] < np.inf)
-    return found, bound, when
+    return found, bound, when, squares
 
 
 def test_runs_are_counted_as_plain_loops_count_them(case):
     sums = dict(tallied(case).sums())
     for window, first in (("all", 0), ("late", 15)):
         for b in range(RUNS):
-            found, bound, when = counted(case, b, first)
+            found, bound, when, squares = counted(case, b, first)
 
             def ours(name, part=0, window=window, b=b):
                 return sums[window, name][part][b]
@@ -82,7 +88,10 @@ def test_runs_are_counted_as_plain_loops_count_them(case):
                 assert ours(name) == found[name], (window, b, name)
                 assert ours(name, 1) == 1
             assert ours("largest_error") == pytest.approx(found["largest"], rel=1e-9)
+            assert ours("unused") == found["unused"]
+            assert ours("unused", 1) == found["number"]
             for e, state in enumerate(NAMES.states):
+                assert ours(f"squared_error:{state}") == pytest.approx(squares[e], rel=1e-12)
                 assert ours(f"bound:{state}") == pytest.approx(bound[e], rel=1e-12)
                 assert ours(f"bound:{state}", 1) == found["number"]
             for i in range(3):
@@ -120,7 +129,9 @@ def test_the_tolerance_is_that_of_rounding():
         shape = np.eye(2)[np.newaxis, :, :, np.newaxis]
         nothing = np.zeros((1, 0, 1))
         integers = np.zeros((1, 1), dtype=np.int64)
-        sets = Sets(shape, integers, integers > 0, nothing, np.zeros((1, 0, 2, 1)))
+        sets = Sets(
+            shape, integers, integers > 0, nothing, np.zeros((1, 0, 2, 1)), np.zeros((1, 1))
+        )
         tally = SetTally(Names(("x", "psi"), (1,), (), ("all",)), TIMES_S[:1], 1)
         tally.add(slice(0, 1), truth, 0 * truth, sets, np.ones((1, 1, 1), dtype=bool))
         assert dict(tally.sums())["all", "violated"][0][0] == violated

@@ -12,10 +12,10 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def shapes(generator, n, lanes, spread=2.0):
-    """Positive definite shapes of very different half-axes."""
-    root = generator.standard_normal((lanes, n, n))
-    root *= 10.0 ** generator.uniform(-spread, spread, (lanes, 1, n))
-    return root @ np.swapaxes(root, 1, 2) + 1e-12 * np.eye(n)
+    """Positive definite shapes: half-axes of 10^-spread to 10^spread in any directions."""
+    directions = np.linalg.qr(generator.standard_normal((lanes, n, n)))[0]
+    root = directions * 10.0 ** generator.uniform(-spread, spread, (lanes, 1, n))
+    return root @ np.swapaxes(root, 1, 2)
 
 
 def on_boundary(generator, shape):

@@ -7,18 +7,22 @@ agree within 5 %, which leaves room for other draws.
 import numpy as np
 import pytest
 
-from hybridtrack.errors import UserError
+from hybridtrack import maps, remainders
+from hybridtrack.errors import Stopped, UserError
 from hybridtrack.estimators import estimators
 from reference_ellipsoids import plain_filter
 from set_models import (
+    NAMES,
     PARALLEL,
     POINTS,
     RESET,
+    R,
     aircraft,
     begun,
     filtered,
     opposed,
     simulated,
+    system,
     truth,
 )
 
@@ -284,6 +288,54 @@ def test_an_impossible_measurement_empties_the_set_and_says_so():
     assert found.violated.tolist() == [False, False, True, False]
 
 
+@pytest.mark.parametrize("name", ["esmf", "ekf"])
+def test_inputs_that_change_are_each_step_s_own(name):
+    """A push that comes at one step only moves the centre there and nowhere else."""
+    from hybridtrack import expressions as ex
+
+    x, u = maps.symbols(NAMES, "state"), maps.symbols(("push",), "input")
+    names = dict(zip((*NAMES, "push"), (*x, *u), strict=True))
+    pushed, seen = (
+        maps.compiled([ex.parse(text, names) for text in texts], x, u)
+        for texts in (("x + push", "y", "psi"), ("x", "y"))
+    )
+    model = aircraft(dynamics=NAMES)._replace(dynamics=pushed, measurement=seen)
+    model = model._replace(inputs=np.array([[0.0], [0.0], [2.0], [0.0]]))
+    nothing = np.full((4, 2, 3), np.nan)  # no scan: the centre is the course
+    mean = begun(model, {}, 3, name).advance(None, nothing).mean
+    np.testing.assert_array_equal(mean[:, 0, 0], [0.0, 0.0, 2.0, 2.0])
+
+
+def test_a_level_is_handed_on_and_kept_where_a_scan_is_missed():
+    """Bertsekas: delta is that of the chosen filter for all, and no measurement changes it."""
+    model = aircraft()
+    _, y = simulated(model, "sphere", 16, steps=40, spread="sphere")
+    running = begun(model, {**RESET, "form": "bertsekas"}, 16)
+    scans = np.ascontiguousarray(np.swapaxes(y, 1, 2))
+    running.advance(None, scans[:39])
+    level = running._filters.level.reshape(3, 16)
+    assert (level > 0).all()
+    np.testing.assert_array_equal(level, level[:1].repeat(3, axis=0))
+    before = running._filters
+    running.advance(None, np.full_like(scans[:1], np.nan))
+    after = running._filters.level.reshape(3, 16)
+    assert (after > 0).all()
+    assert (after < before.level.reshape(3, 16)).all()  # (1 - beta) of it, as the noise is new
+    assert (after > 0.5 * before.level.reshape(3, 16)).all()
+
+
+def test_a_filter_stops_when_asked_to():
+    import threading
+
+    model, stop = aircraft(), threading.Event()
+    estimator = estimators()["esmf"]
+    settings = estimator.settings()
+    running = estimator.begin(settings, estimator.prepare(settings, model), np.zeros((3, 4)), stop)
+    stop.set()
+    with pytest.raises(Stopped):
+        running.advance(None, np.zeros((1, 2, 4)))
+
+
 def test_a_missed_scan_only_predicts():
     model = aircraft()
     states, y = simulated(model, "ball", 4, steps=3)
@@ -293,6 +345,55 @@ def test_a_missed_scan_only_predicts():
     assert abs(moved[1]) < 1e-15
     assert (np.abs(moved[[0, 2, 3]]) > 1e-9).all()
     assert not found.violated.any()
+
+
+def test_a_nonlinear_scan_is_fused_as_on_paper():
+    """One state, x -> 3 x, seen as x + x^2/4: its remainder over the prediction is [0, P/4]."""
+    s, Q, R, centre, y, rho = 0.2, 0.01**2, 0.1**2, 0.7, 3.1, 0.05
+    moved, seen = system(("3*x",), ("x",)), system(("x + x**2/4",), ("x",))
+    model = aircraft()._replace(
+        dynamics=moved,
+        measurement=seen,
+        dynamics_remainder=remainders.remainder(moved),
+        measurement_remainder=remainders.remainder(seen),
+        state_names=("x",),
+        process_noise_shape=np.array([[Q]]),
+        measurement_noise_shape=np.array([[R]]),
+        initial_shape=np.array([[s**2]]),
+    )
+    estimator = estimators()["esmf"]
+    running = estimator.begin(estimator.settings(), model, np.array([[centre]]))
+    mean = running.advance(None, np.array([[[y]]])).mean.item()
+    P = (3 * s + np.sqrt(Q)) ** 2
+    C, noise = 1 + 3 * centre / 2, (P / 8 + np.sqrt(R)) ** 2
+    S = C**2 * P / (1 - rho) + noise / rho
+    e = y - (3 * centre + (3 * centre) ** 2 / 4 + P / 8)
+    K = C * P / (1 - rho) / S
+    assert mean == pytest.approx(3 * centre + K * e, rel=1e-6)
+    shape = (1 - e**2 / S) * (1 - K * C) * P / (1 - rho)
+    assert running.sets.shape.item() == pytest.approx(shape, rel=1e-6)
+
+
+def test_a_component_without_a_bound_is_left_out_alone():
+    """A bearing across its cut says nothing; the range beside it goes on as if it were alone."""
+    texts = ("sqrt(x**2 + y**2)", "atan2(y, x)")
+    both, alone = aircraft(measurement=texts), aircraft(measurement=texts[:1])
+    alone = alone._replace(measurement_noise_shape=R[:1, :1])
+    y = np.array([[[5.0, np.pi - 0.01]] * 4])
+    start = {"centre": np.array([-5.0, 0.0, 0.3]), "wide": 0.2}
+    found = []
+    for model, scan in ((both, y), (alone, y[..., :1])):
+        running = begun(model, {"box": "count"}, 4)
+        filters = running._filters
+        running._filters = filters._replace(
+            centre=filters.centre + start["centre"], shape=start["wide"] ** 2 + filters.shape
+        )
+        running.advance(None, np.ascontiguousarray(np.swapaxes(scan, 1, 2)))
+        found.append(running)
+    np.testing.assert_allclose(found[0]._filters.centre, found[1]._filters.centre, rtol=1e-12)
+    np.testing.assert_allclose(found[0]._filters.shape, found[1]._filters.shape, rtol=1e-12)
+    assert (found[0].sets.unused == 0.5).all()
+    assert (found[1].sets.unused == 0.0).all()
 
 
 def test_a_nonlinear_sensor_keeps_the_truth():

@@ -92,7 +92,7 @@ REFUSED = [
     ("*x", "no expression"),
     ("x = 1", "no expression"),
     ("x +", "no expression"),
-    ("", "no expression"),
+    ("", "it is empty"),
     ("x; y", "no expression"),
     ("x\x00", "no expression"),
     ("psii", "did you mean 'psi'"),
@@ -131,6 +131,8 @@ REFUSED = [
     ("cos(" * 100 + "x" + ")" * 100, "nested deeper"),
     ("x" + "+x*1" * 300, "characters"),
     ("+".join("x" * 40), "OK"),
+    ("+".join("x" * 70), "OK"),
+    ("+".join("x" * 200), "numbers and names"),
     ("+".join(["cos(x+x+x+x+x+x+x+x+x+x)"] * 8), "numbers and names"),
 ]
 

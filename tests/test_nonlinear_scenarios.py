@@ -73,6 +73,14 @@ MISTAKES = [
     ("measurement: {x: x, y: y}", "measurement: {x: x, y: z}", "'z' is not known"),
     ("measurement: {x: x, y: y}", "measurement: {}", "'measurement' has no entries"),
     ("angles: [psi]", "angles: [phi]", "'phi' is no state"),
+    ("units: {x: m,", 'units: {x: "m\\n",', "has letters that no figure can show"),
+    ("start: [0, 0, 0]", "start: [1.0e17, 0, 0]", "where numbers are too far apart for it"),
+    ("  psi: psi + T*w1\n", "  psi: ''\n", "it is empty"),
+    (
+        "windows: {late: {from_s: 0.3}}",
+        "windows: {late: {after_switch_s: 1}}",
+        "no modes here that could switch",
+    ),
     ("units: {x: m,", "units: {q: m,", "'q' is no state and no measurement"),
     ("units: {x: m,", "units: {psi: deg, x: m,", "are in rad, and its unit is deg"),
     ("x + T*(-v0 + v1*cos(psi))", "(x + 1)**2", "has no finite value at step"),
@@ -329,6 +337,30 @@ def test_noise_in_the_ellipsoid_that_filters_believe_in_is_inside(tmp_path, caps
     _, folder = run(tmp_path, settings_=chosen)
     tables.show(folder, Console(width=200))
     assert "leaves its ellipsoid" not in capsys.readouterr().out
+    one = loaded(tmp_path, AIRCRAFT, *chosen).nonlinear
+    np.testing.assert_allclose(np.diag(one.process_noise_shape), 3 * 0.01**2)
+    np.testing.assert_allclose(np.diag(one.measurement_noise_shape), 2 * 0.09**2)
+
+
+def test_units_with_signs_of_mathematics_are_drawn_as_they_are(tmp_path):
+    from hybridtrack import pictures
+
+    text = AIRCRAFT.replace("units: {x: m, y: m}", "units: {x: '$\\frac{$', y: ''}")
+    _, folder = run(tmp_path, text=text)
+    assert {path.stem for path in pictures.draw_run(folder)} >= {"sets", "bound"}
+
+
+def test_what_cannot_be_bounded_is_told(tmp_path, capsys):
+    """A heading that jumps by pi every half turn: there it is left out, and the run says so."""
+    from rich.console import Console
+
+    text = AIRCRAFT.replace("measurement: {x: x, y: y}", "measurement: {x: x, y: atan(tan(psi))}")
+    chosen = ("truth.start=[0, 0, 1.4]", "noise.kind=ball", "estimators.RESET={type: esmf}")
+    _, folder = run(tmp_path, text=text, settings_=chosen)
+    sets = read_table(folder, "sets").set_index(["estimator", "figure"]).value
+    assert sets["ESMF", "violated_runs"] == 0
+    tables.show(folder, Console(width=200))
+    assert "ESMF leaves out" in capsys.readouterr().out
 
 
 def test_an_adversary_plays_against_one_estimator(tmp_path):

@@ -110,6 +110,51 @@ def test_where_a_map_has_no_value_its_remainder_is_unbounded():
     assert (most == np.inf).all()
 
 
+@pytest.mark.parametrize("text", ["atan(tan(x))", "atan(sin(x)/cos(x))", "atan2(tan(x), 1)"])
+def test_a_jump_that_no_derivative_knows_is_unbounded(text):
+    """SymPy's derivative of atan(tan(x)) is 1, and its value falls by pi at pi/2."""
+    whole = remainders.remainder(system((text,)))
+    centre = np.array([[1.4, 0.0, 0.0]])
+    least, most = whole.enclose(centre, centre - 0.4, centre + 0.4, U)
+    assert (least[0, 0], most[0, 0]) == (-np.inf, np.inf)
+    assert np.isfinite(whole.enclose(centre, centre - 0.1, centre + 0.1, U)).all()
+
+
+def test_negative_powers_are_enclosed():
+    """Dense places of x^-2 and x^-4, which are no x^2 and x^4."""
+    map_ = system(("x**-2", "x**-4", "(x + y)**-3"))
+    whole = remainders.remainder(map_)
+    centre = np.array([2.0, 0.5, 0.0])
+    low, high = centre - 0.7, centre + 0.7
+    least, most = whole.enclose(centre[None], low[None], high[None], U)
+    found = sampled(map_, centre, low, high, np.random.default_rng(3), 2000)
+    assert (found >= least[0]).all()
+    assert (found <= most[0]).all()
+    assert (most[0] - least[0] < 12 * np.ptp(found, axis=0)).all()
+
+
+def test_in_front_a_bearing_is_bounded():
+    """The cut is behind: y about 0 is no matter where x is positive."""
+    whole = remainders.remainder(system(("atan2(y, x)",)))
+    centre = np.array([[3.0, 0.0, 0.0]])
+    assert np.isfinite(whole.enclose(centre, centre - 0.4, centre + 0.4, U)).all()
+
+
+def test_waves_of_high_frequency_allow_for_their_rounding():
+    """Against 40 digits, where the angle's own last bits are worth 1e-8 of the remainder."""
+    import mpmath
+
+    w, c = 1e6, 1.0
+    whole = remainders.remainder(system((f"sin({w:.0f}*x)",)))
+    centre, reach = np.array([[c, 0.0, 0.0]]), np.array([[1e-3, 0.0, 0.0]])
+    least, most = whole.enclose(centre, centre - reach, centre + reach, U)
+    with mpmath.workdps(40):
+        slope, value = w * mpmath.cos(w * c), mpmath.sin(w * c)
+        for t in np.linspace(-1e-3, 1e-3, 4001):
+            exact = mpmath.sin(w * (c + mpmath.mpf(t))) - value - slope * mpmath.mpf(t)
+            assert least[0, 0] <= exact <= most[0, 0]
+
+
 def test_a_wave_of_an_input_has_its_amplitude():
     """A x_v-wave whose amplitude an input gives is exact as well."""
     from hybridtrack import expressions as ex

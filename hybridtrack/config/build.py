@@ -205,7 +205,7 @@ def _window(
     after_s, within_s = window.after_switch_s, window.within_switch_s
     if not truth_modes and (after_s, within_s) != (None, None):
         raise document.error(
-            path, "a recording has no known switches of mode; use 'from_s' and 'until_s'"
+            path, "the truth has no modes here that could switch; use 'from_s' and 'until_s'"
         )
     if after_s is not None and within_s is not None and after_s >= within_s:
         raise document.error(

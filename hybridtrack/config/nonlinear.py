@@ -31,6 +31,7 @@ from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case, step_lengths
 
 RADIANS = "rad"
+ROUNDINGS = 100  # that a set has to be wider than, to hold the truth for certain
 LARGEST_STATE = 1e30  # a truth beyond it runs away
 MOST_STEPS = 100_000  # of a nonlinear course, which Python steps through
 
@@ -89,7 +90,11 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
 def _units(form: NonlinearForm, document: Document) -> dict[str, str]:
     """Units by name of state or measurement; an angle is in radians, the rest as written."""
     known = tuple(dict.fromkeys([*form.states, *form.measurement]))
-    for name in form.units:
+    for name, unit in form.units.items():
+        if not unit.isprintable():
+            raise document.error(
+                ("units", name), f"the unit of '{shown(name)}' has letters that no figure can show"
+            )
         if name not in known:
             raise document.error(
                 ("units", name),
@@ -238,6 +243,16 @@ def _check_course(model: NonlinearModel, start: Array, times_s: Array, document:
             f"without noise the truth has no finite value at step {k} ({times_s[k]:g} s); end "
             "'clock' before, or change 'dynamics' or 'start'",
         )
+    shape = np.diagonal(model.initial_shape)
+    for name, largest, width in zip(
+        model.state_names, np.abs(course).max(axis=0), np.sqrt(shape), strict=True
+    ):
+        if width < ROUNDINGS * np.spacing(largest):
+            raise document.error(
+                ("initial", "half_axes", name),
+                f"the half-axis of '{name}' is {width:g}, and the truth reaches {largest:g}, where "
+                "numbers are too far apart for it; move the origin, or widen it",
+            )
 
 
 def _check_inputs(model: NonlinearModel, names: tuple[str, ...], document: Document) -> None:

@@ -23,7 +23,7 @@ from hybridtrack.config.schema import (
 from hybridtrack.estimators import estimators
 
 Expression = str | float
-Unit = Annotated[str, Field(min_length=1, max_length=12)]
+Unit = Annotated[str, Field(max_length=12)]
 
 if TYPE_CHECKING:
     SetEstimatorUnion: TypeAlias = Any

@@ -26,6 +26,7 @@ class Sets(NamedTuple):
     # Of every operating point's own filter; (n_steps, 0, ...) where there are none:
     point_trace: Array  # (n_steps, n_points, lanes)
     point_bound: Array  # (n_steps, n_points, n_x, lanes)
+    unused: Array  # (n_steps, lanes) share of the components measured that the filter left out
 
 
 def blank(n_steps: int, n_x: int, n_points: int, lanes: int) -> tuple[Array, Sets]:
@@ -36,6 +37,7 @@ def blank(n_steps: int, n_x: int, n_points: int, lanes: int) -> tuple[Array, Set
         empty=np.zeros((n_steps, lanes), dtype=np.bool_),
         point_trace=np.empty((n_steps, n_points, lanes)),
         point_bound=np.empty((n_steps, n_points, n_x, lanes)),
+        unused=np.zeros((n_steps, lanes)),
     )
 
 

@@ -28,7 +28,7 @@ from hybridtrack.ellipsoids import (
     trace,
     update,
 )
-from hybridtrack.errors import Unsuited
+from hybridtrack.errors import Stopped, Unsuited
 from hybridtrack.estimators import NO_KNOWN_MODES, Estimates
 from hybridtrack.estimators._sets import Nonlinear, Sets, blank, estimates, note_points
 from hybridtrack.models import Array
@@ -86,6 +86,7 @@ class Step(NamedTuple):
     filters: Filters
     noise: Array  # Qhat (., n_x, n_x)
     empty: Any  # (.,)
+    unused: Array  # (.,) share of the components measured that were left out
 
 
 class Running:
@@ -112,7 +113,7 @@ class Running:
         )
         first = np.maximum(half_widths(model.initial_shape), half_widths(model.process_noise_shape))
         self._limit = settings.growth * first  # (n_x,)
-        self._step = 0
+        self._step, self._stop = 0, stop
         self._diverged = np.zeros(self._lanes, dtype=np.bool_)
         self.mode_names: tuple[str, ...] = ()
         self.state_names = model.state_names
@@ -132,6 +133,8 @@ class Running:
         mean, self.sets = blank(n_steps, n_x, len(self.point_names), lanes)
         with np.errstate(all="ignore"):
             for k in range(n_steps):
+                if self._stop is not None and self._stop.is_set():
+                    raise Stopped
                 step = self._advance_one(measurements[k].T)
                 self._note(k, mean, step)
         return estimates(mean)
@@ -144,9 +147,9 @@ class Running:
         self._step += 1
         predicted, noise = self._predict(u)
         y = np.tile(measurement, (self._count, 1))
-        filters, empty = self._fuse(predicted, y, u)
+        filters, empty, unused = self._fuse(predicted, y, u)
         self._filters = filters
-        return Step(filters, noise, empty)
+        return Step(filters, noise, empty, unused)
 
     def _predict(self, u: Array) -> tuple[Filters, Array]:
         """Otanez 2004, eq. 1, 2 and 18-23; with Qhat."""
@@ -163,23 +166,33 @@ class Running:
         # (1 - beta) (1 - delta) + beta is what the sum's own distances stay below.
         return Filters(centre, total.shape, (1.0 - total.beta) * now.level), noise
 
-    def _fuse(self, predicted: Filters, y: Array, u: Array) -> tuple[Filters, Any]:
-        """Otanez 2004, eq. 3-6, or 29-30; and where nothing is left."""
+    def _fuse(self, predicted: Filters, y: Array, u: Array) -> tuple[Filters, Any, Array]:
+        """Otanez 2004, eq. 3-6, or 29-30; where nothing is left; and what share went unused.
+
+        A component whose linearisation leaves out what has no bound says nothing: it is left out.
+        """
         settings, model = self._settings, self._model
         at = self._at if self._points.size else predicted.centre
         C = model.measurement.jacobian(at, u)
         guess = model.measurement.value(at, u)
         guess += (C @ (predicted.centre - at)[..., np.newaxis])[..., 0]
-        R = np.broadcast_to(model.measurement_noise_shape, (len(y), *2 * (y.shape[1],)))
+        unbounded = np.isnan(guess) | ~np.isfinite(C).all(axis=2)
+        radius = np.zeros_like(guess)
         if not model.measurement_remainder.is_zero:
             bound, centre = predicted.bound, predicted.centre
             middle, radius = self._remainder(model.measurement_remainder, at, centre, bound, u)
-            guess += middle
-            beta = None if isinstance(settings.beta, str) else settings.beta
-            R = add(_diagonal(around_box(radius, settings.box)), R, beta).shape
-        innovation = y - guess
-        missed: NDArray[np.bool_] = np.asarray(np.isnan(innovation).any(axis=1))
-        innovation = np.where(missed[:, np.newaxis], 0.0, innovation)
+            unbounded |= ~np.isfinite(radius)
+            guess += np.where(unbounded, 0.0, middle)
+        without = unbounded | np.isnan(y)  # these have no part in what follows
+        innovation = np.where(without, 0.0, y - guess)
+        C = np.where(without[..., np.newaxis], 0.0, C)
+        kept = (~without).astype(np.float64)
+        R = kept[:, :, np.newaxis] * model.measurement_noise_shape * kept[:, np.newaxis]
+        box = around_box(np.where(without, 0.0, radius), settings.box)
+        beta = None if isinstance(settings.beta, str) else settings.beta
+        R = add(_diagonal(box), R, beta).shape
+        R += _diagonal(1.0 - kept)  # anything that has an inverse
+        missed: NDArray[np.bool_] = np.asarray(without.all(axis=1))
 
         def fused(rho: Array) -> Fused:
             return update(predicted.centre, predicted.shape, innovation, C, R, rho)
@@ -193,13 +206,15 @@ class Running:
             shape = (1.0 - found.distance)[:, np.newaxis, np.newaxis] * found.shape
         spent = level if settings.form == "bertsekas" else found.distance
         empty = (spent > 1.0) & ~missed
-        kept = missed | empty  # the prediction stands
+        stands = missed | empty  # the prediction
         filters = Filters(
-            np.where(kept[:, np.newaxis], predicted.centre, found.centre),
-            np.where(kept[:, np.newaxis, np.newaxis], predicted.shape, shape),
-            np.where(kept, predicted.level, level),
+            np.where(stands[:, np.newaxis], predicted.centre, found.centre),
+            np.where(stands[:, np.newaxis, np.newaxis], predicted.shape, shape),
+            np.where(stands, predicted.level, level),
         )
-        return filters, empty
+        measured = ~np.isnan(y)
+        unused = (unbounded & measured).sum(axis=1) / np.maximum(measured.sum(axis=1), 1)
+        return filters, empty, unused
 
     def _rho(self, fused: Any, lanes: int) -> Array:
         rule = self._settings.rho
@@ -251,6 +266,7 @@ class Running:
         mean[k][:, self._diverged] = np.nan
         sets.shape[k] = np.moveaxis(shape, 0, -1)
         sets.chosen[k] = chosen
+        sets.unused[k] = step.unused[row]
         sets.empty[k] = step.empty.reshape(n, lanes).any(axis=0) & ~self._diverged
         if self.point_names:
             note_points(sets, k, bound.reshape(n, lanes, *bound.shape[1:]))
