@@ -211,7 +211,7 @@ class BoundedRuns:
         assert self.opponent is not None
         model, R = self._truth.model, self._truth.measurement.shape
         guess = model.dynamics.value(self.opponent.centre, u)
-        error = clean - model.measurement.value(guess, u)
+        error = model.innovation(clean, model.measurement.value(guess, u))
         return _to_boundary(-error, R, direction)
 
 

@@ -64,10 +64,11 @@ class Remainder(NamedTuple):
         return result
 
 
-def remainder(map_: Map) -> Remainder:
-    """The remainder of a map."""
+def remainder(map_: Map, turning: Sequence[int] = ()) -> Remainder:
+    """The remainder of a map; turning: components that count but for whole turns of 2 pi."""
     found = waves(map_)
-    return Remainder(map_, found, Balls(map_) if any(one is None for one in found) else None)
+    balls = Balls(map_, turning) if any(one is None for one in found) else None
+    return Remainder(map_, found, balls)
 
 
 def wave_range(centre: Array, low: Array, high: Array) -> Enclosed:
@@ -101,8 +102,8 @@ def wave_range(centre: Array, low: Array, high: Array) -> Enclosed:
 class Balls:
     """Remainders of any map by interval arithmetic, lane by lane."""
 
-    def __init__(self, map_: Map) -> None:
-        """Compile derivatives to functions of balls."""
+    def __init__(self, map_: Map, turning: Sequence[int] = ()) -> None:
+        """Compile derivatives to functions of balls; turning: as in `remainder`."""
         import sympy
 
         arguments = (*map_.states, *map_.inputs)
@@ -112,6 +113,7 @@ class Balls:
             for i, one in enumerate(map_.expressions)
             for angle in sorted(one.atoms(sympy.atan2), key=str)
             if angle.free_symbols & set(map_.states)
+            and not (i in turning and _jumps_by_turns(one, angle))
         ]
         self._cut = [i for i, _ in cuts]
         sides = [side for _, angle in cuts for side in angle.args]
@@ -175,6 +177,20 @@ class Balls:
             return [arb(value) for value in function(*arguments)]
         except (ZeroDivisionError, ValueError):
             return [arb("0 +/- inf")] * count
+
+
+def _jumps_by_turns(expression: Any, angle: Any) -> bool:
+    """Whether an angle stands in an expression as a term, a whole number of times, and no more."""
+    import sympy
+
+    rest, found = [], 0
+    for term in sympy.Add.make_args(expression):
+        times, product = term.as_coeff_Mul()
+        if product == angle and times.is_Integer:
+            found += 1
+        else:
+            rest.append(term)
+    return found == 1 and not any(term.has(angle) for term in rest)
 
 
 def over_balls(arguments: Sequence[Any], expressions: Sequence[Any]) -> Callable[..., Any]:

@@ -36,6 +36,7 @@ def aircraft(contains_box=False, dynamics=None, measurement=("x", "y")):
         state_names=NAMES,
         measurement_names=("x", "y"),
         angles=(2,),
+        measured_angles=(),
         inputs=np.zeros((1, 0)),
         process_noise_shape=many[0] * Q,
         measurement_noise_shape=many[1] * R,
@@ -77,7 +78,7 @@ class Outcome:
         self.violated = (largest > 1 + 1e-9) | self.empty
         self.largest = float(np.nanmax(largest))
         self.heading = np.sqrt(shape[:, :, 2, 2])
-        self.chosen = sets.chosen
+        self.chosen, self.unused = sets.chosen, sets.unused
         by_run = np.where(self.diverged, np.inf, self.heading.mean(axis=0))
         self.median_heading = float(np.median(by_run))
 
@@ -89,22 +90,25 @@ def filtered(model, settings, states, measurements, name="esmf"):
     return Outcome(states, found.mean, running.sets)
 
 
-def opposed(model, settings, runs, steps=STEPS, seed=1, spread="sphere"):
-    """The outcome of a filter against its adversary."""
-    whole = bounded.BoundedRuns(
-        truth(model, "adversary", spread, "it"),
-        lambda purpose: stream(seed, 0, 0, purpose),
-        runs,
-        runs,
-    )
+def played(model, settings, whole, runs, steps, seed=1):
+    """The outcome of a filter on a truth of its own; an adversary plays against it."""
+    one = bounded.BoundedRuns(whole, lambda p: stream(seed, 0, 0, p), runs, runs)
     shadow = begun(model, settings, runs)
 
     def advance(measurements):
         found = shadow.advance(None, np.ascontiguousarray(measurements.T)[np.newaxis])
         return found.mean[0].T, np.moveaxis(shadow.sets.shape[0], -1, 0)
 
-    start = np.tile(model.initial_shape, (runs, 1, 1))
-    whole.opponent = bounded.Opponent(np.zeros((runs, 3)), start, advance)
-    states, measurements, outside = whole.advance(steps)
+    if whole.against is not None:
+        start = np.tile(model.initial_shape, (runs, 1, 1))
+        one.opponent = bounded.Opponent(np.zeros((runs, 3)), start, advance)
+    states, measurements, outside = one.advance(steps)
     assert not outside.any()
-    return filtered(model, settings, states, measurements)
+    outcome = filtered(model, settings, states, measurements)
+    outcome.measured = measurements
+    return outcome
+
+
+def opposed(model, settings, runs, steps=STEPS, seed=1, spread="sphere"):
+    """The outcome of a filter against its adversary."""
+    return played(model, settings, truth(model, "adversary", spread, "it"), runs, steps, seed)

@@ -7,7 +7,7 @@ agree within 5 %, which leaves room for other draws.
 import numpy as np
 import pytest
 
-from hybridtrack import maps, remainders
+from hybridtrack import bounded, maps, remainders
 from hybridtrack.errors import Stopped, UserError
 from hybridtrack.estimators import estimators
 from reference_ellipsoids import plain_filter
@@ -21,6 +21,7 @@ from set_models import (
     begun,
     filtered,
     opposed,
+    played,
     simulated,
     system,
     truth,
@@ -394,6 +395,32 @@ def test_a_component_without_a_bound_is_left_out_alone():
     np.testing.assert_allclose(found[0]._filters.shape, found[1]._filters.shape, rtol=1e-12)
     assert (found[0].sets.unused == 0.5).all()
     assert (found[1].sets.unused == 0.0).all()
+
+
+@pytest.mark.parametrize("form", ["schweppe", "bertsekas"])
+def test_a_measured_angle_may_pass_its_cut(form):
+    """Eastwards past a sensor in the north-west: the bearing jumps by a turn, and nothing else."""
+    seen = system(("sqrt((x - 5)**2 + y**2)", "atan2(y, x - 5)"))
+    model = aircraft(measurement=("x", "y"))._replace(
+        measurement=seen,
+        measurement_remainder=remainders.remainder(seen, (1,)),
+        measured_angles=(1,),
+        measurement_noise_shape=np.diag([0.05, 0.02]) ** 2,
+    )
+    kinds = {"persistent_ball": "sphere", "adversary": "sphere"}
+    for kind, spread in kinds.items():
+        noise = bounded.Noise(kind, model.measurement_noise_shape, 40)
+        whole = truth(model, kind, spread, "it" if kind == "adversary" else None)
+        whole = whole._replace(measurement=noise, start=np.array([0.0, 0.0, 0.0]))
+        found = played(model, {"form": form}, whole, 32, 40)
+        assert (np.diff(np.sign(found.measured[..., 1]), axis=0) != 0).any()
+        assert not found.violated.any(), kind
+        assert not found.unused.any()
+    alone = model._replace(measured_angles=(), measurement_remainder=remainders.remainder(seen))
+    assert played(alone, {"form": form}, whole, 32, 40).unused.any()
+    whole = whole._replace(process=whole.process._replace(kind="ball"), against=None)
+    far = model._replace(initial_shape=9.0 * np.eye(3))  # which turn it is in isn't known at first
+    assert played(far, {"form": form}, whole, 4, 1).unused.any()
 
 
 def test_a_nonlinear_sensor_keeps_the_truth():

@@ -72,7 +72,7 @@ MISTAKES = [
     ("  psi: psi + T*w1\n", "", "'dynamics' has no expression for 'psi'"),
     ("measurement: {x: x, y: y}", "measurement: {x: x, y: z}", "'z' is not known"),
     ("measurement: {x: x, y: y}", "measurement: {}", "'measurement' has no entries"),
-    ("angles: [psi]", "angles: [phi]", "'phi' is no state"),
+    ("angles: [psi]", "angles: [phi]", "'phi' is no state and no measurement"),
     ("units: {x: m,", 'units: {x: "m\\n",', "has letters that no figure can show"),
     ("start: [0, 0, 0]", "start: [1.0e17, 0, 0]", "where numbers are too far apart for it"),
     ("  psi: psi + T*w1\n", "  psi: ''\n", "it is empty"),

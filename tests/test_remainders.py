@@ -133,6 +133,26 @@ def test_negative_powers_are_enclosed():
     assert (most[0] - least[0] < 12 * np.ptp(found, axis=0)).all()
 
 
+@pytest.mark.parametrize(
+    ("bearing", "bounded"),
+    [
+        ("atan2(y, x)", True),
+        ("psi - 2*atan2(y, x)", True),
+        ("atan2(y, x)/2", False),
+        ("cos(psi)*atan2(y, x)", False),
+        ("atan2(y, x) + sin(atan2(y, x)/2)", False),
+    ],
+)
+def test_what_counts_but_for_whole_turns_has_no_cut(bearing, bounded):
+    """A jump of a whole turn is none, of half a turn it is one."""
+    whole = remainders.remainder(system((bearing,)), turning=(0,))
+    centre = np.array([[-3.0, 0.2, 0.1]])
+    least, most = whole.enclose(centre, centre - 0.3, centre + 0.3, U)
+    assert np.isfinite([least, most]).all() == bounded
+    round_the_pole = whole.enclose(centre, centre - 3.2, centre + 3.2, U)
+    assert np.isinf(round_the_pole).all()
+
+
 def test_in_front_a_bearing_is_bounded():
     """The cut is behind: y about 0 is no matter where x is positive."""
     whole = remainders.remainder(system(("atan2(y, x)",)))

@@ -116,8 +116,13 @@ def _units(form: NonlinearForm, document: Document) -> dict[str, str]:
 def _model(form: NonlinearForm, n_steps: int, document: Document) -> NonlinearModel:
     states, inputs = tuple(form.states), tuple(form.inputs)
     _check_names(form, document)
+    known = tuple(dict.fromkeys([*states, *form.measurement]))
     for i, angle in enumerate(form.angles):
-        _known_state(angle, states, document, ("angles", i))
+        if angle not in known:
+            raise document.error(
+                ("angles", i),
+                f"'{shown(angle)}' is no state and no measurement; {checks.nearest(angle, known)}",
+            )
     x, u = symbols(states, "state"), symbols(inputs, "input")
     names = dict(zip(states, x, strict=True)) | dict(zip(inputs, u, strict=True))
     names |= {name: number(value) for name, value in form.constants.items()}
@@ -133,15 +138,17 @@ def _model(form: NonlinearForm, n_steps: int, document: Document) -> NonlinearMo
     measurement = _map("measurement", form.measurement, names, x, u, document)
     process, noise = form.noise.process, form.noise.measurement
     measured = tuple(form.measurement)
+    turning = tuple(i for i, name in enumerate(measured) if name in form.angles)
     scale = (len(states), len(measured)) if form.noise.contains_box else (1, 1)
     return NonlinearModel(
         dynamics=dynamics,
         measurement=measurement,
         dynamics_remainder=remainder(dynamics),
-        measurement_remainder=remainder(measurement),
+        measurement_remainder=remainder(measurement, turning),
         state_names=states,
         measurement_names=measured,
-        angles=tuple(states.index(angle) for angle in form.angles),
+        angles=tuple(states.index(angle) for angle in form.angles if angle in states),
+        measured_angles=turning,
         inputs=_inputs(form, n_steps, document),
         process_noise_shape=scale[0] * _ellipsoid(process, states, document, ("noise", "process")),
         measurement_noise_shape=scale[1]

@@ -67,7 +67,7 @@ class Running:
         mean = model.dynamics.value(self._mean, u)
         P = A @ self._covariance @ np.swapaxes(A, -1, -2) + self._Q
         C = model.measurement.jacobian(mean, u)
-        innovation = measurement - model.measurement.value(mean, u)
+        innovation = model.innovation(measurement, model.measurement.value(mean, u))
         missed: NDArray[np.bool_] = np.asarray(np.isnan(innovation).any(axis=1))
         PC = P @ np.swapaxes(C, -1, -2)
         K = PC @ inverse(symmetric(C @ PC + self._R))

@@ -183,8 +183,12 @@ class Running:
             middle, radius = self._remainder(model.measurement_remainder, at, centre, bound, u)
             unbounded |= ~np.isfinite(radius)
             guess += np.where(unbounded, 0.0, middle)
+        reach = half_widths(C @ predicted.bound @ np.swapaxes(C, -1, -2)) + radius
+        reach += half_widths(model.measurement_noise_shape)
+        turns = list(model.measured_angles)
+        unbounded[:, turns] |= ~(reach[:, turns] < np.pi)  # which turn it is in isn't known
         without = unbounded | np.isnan(y)  # these have no part in what follows
-        innovation = np.where(without, 0.0, y - guess)
+        innovation = np.where(without, 0.0, model.innovation(y, guess))
         C = np.where(without[..., np.newaxis], 0.0, C)
         kept = (~without).astype(np.float64)
         R = kept[:, :, np.newaxis] * model.measurement_noise_shape * kept[:, np.newaxis]
