@@ -438,3 +438,60 @@ def test_a_measurement_that_is_not_linear_has_a_remainder_too():
     np.testing.assert_allclose(
         weighed.place(RANGE, 2).points, linear.place(RANGE, 2).points, atol=1e-9
     )
+
+
+# ---- what a reader met -----------------------------------------------------------------------
+
+
+def one_state(expression):
+    return from_expressions(("x",), (expression,), (X,), ("x",), np.ones(1))
+
+
+def test_where_the_curvature_changes_its_sign_the_error_itself_is_searched():
+    """x^3 on [-1, 1]: at -1/2 and 1/2 the error is 1/2, a bound's point has 1 (by hand)."""
+    found = place_one(one_state(X**3), EXACT, -1.0, 1.0, 1)
+    assert found.worst_error == pytest.approx(0.5, abs=1e-4)
+    assert abs(found.points[0, 0]) == pytest.approx(0.5, abs=1e-4)
+    assert not found.certificate
+    better = place_one(one_state(X**3), EXACT, -1.0, 1.0, 1, 0, [np.array([[0.5]])])
+    assert better.worst_error <= 0.5 + 1e-12
+
+
+def test_an_error_that_rounding_makes_rough_is_covered():
+    from hybridtrack.analyses._placement import _walk, smallest_level
+
+    function = one_state(X + sympy.Float(0.1) * sympy.sin(X))
+    bound = majorant(function, -2.0, 2.0)
+    for count in range(1, 7):
+        smallest_level(lambda q, n=count: _walk(bound, -2.0, 2.0, q, n), 0.5)
+
+
+def test_without_process_noise_nothing_crashes():
+    no, one = np.zeros((1, 1)), np.eye(1)
+    for rule in NAMES:
+        found = steady(0.5 * one, one, no, one, rule)
+        assert found is None or found.half_widths[0] <= 0.5 + 1e-9
+
+
+def test_what_is_not_finite_has_no_steady_ellipsoid():
+    one = np.eye(1)
+    assert steady(np.full((1, 1), np.nan), one, one, one, "trace_trace") is None
+    assert steady(one, one, np.full((1, 1), np.inf), one, "trace_trace") is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_not_measured_at_a_place_divides_by_nothing():
+    one = np.eye(1)
+    for rule in NAMES:
+        steady(0.9 * one, np.zeros((1, 1)), one, one, rule)
+
+
+def test_local_solvers_end_at_the_same_parts_of_any_range():
+    scale = sympy.Float(1e-5)
+    small = one_state(scale * sympy.sin(X / scale))
+    ends = []
+    for function, high in ((one_state(sympy.sin(X)), 1.0), (small, 1e-5)):
+        box = (np.zeros(1), np.array([high]))
+        ends.append([o.worst_errors / high for o in local_starts(function, EXACT, *box, 2, 8, 1)])
+    # the last bits send some starts elsewhere
+    assert np.isclose(ends[0], ends[1], rtol=1e-2).mean() > 0.85

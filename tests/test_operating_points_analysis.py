@@ -8,6 +8,7 @@ import pytest
 
 from hybridtrack import config
 from hybridtrack.analyses import analyses
+from hybridtrack.analyses._operating_words import place, share
 from hybridtrack.config.schema import ANALYSIS_FORMS
 from hybridtrack.errors import Unsuited
 from test_cli import hybridtrack
@@ -293,3 +294,16 @@ def test_an_analysis_is_the_same_twice():
     assert first.table == second.table
     assert first.tables == second.tables
     assert not any(math.isnan(e) for e in first.tables["local_starts"].columns["worst_error"])
+
+
+def test_shares_are_0_and_100_per_cent_only_where_they_are():
+    assert [share(part) for part in (0.0, 0.01, 0.55, 0.983, 1.0)] == [
+        *("0 %", "under 5 %", "55 %", "over 95 %", "100 %")
+    ]
+
+
+def test_places_have_the_digits_of_their_range():
+    assert place(0.7853981, 1.57) == "0.785"
+    assert place(-1e-9, 4.0) == "0.000"
+    assert place(2.63e-6, 1e-5) == "2.63e-06"
+    assert place(12345.6, 2e5) == "1.23e+04"

@@ -4,6 +4,7 @@ Eq. 33 of Otanez 2004 is a largest error of best models: it has kinks wherever a
 worst, and many local minima. In one state meetings of regions are interpolated between places.
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -95,6 +96,30 @@ class Objective:
         np.maximum.at(result, a, meeting)
         np.maximum.at(result, b, meeting)
         return result
+
+
+class Scaled(Objective):
+    """The same of points that are parts of the range, 0 to 1: solvers' steps have no unit."""
+
+    def __init__(
+        self, function: Nonlinear, kind: str, box: tuple[Array, Array], count: int
+    ) -> None:
+        super().__init__(function, kind, box, count)
+        low, high = box
+        judged, width = self._errors, high - low
+        self._errors = lambda parts: judged(low + width * parts)
+        self._nudge = np.full(len(low), NUDGE)
+        self.box = [(0.0, 1.0)] * (count * len(low))
+
+    def ends(self, start: Array) -> dict[str, Array]:
+        """Where every solver ends (n d,), by its name; what gave up above its start, there."""
+        found = {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a solver's steps out of bounds, which it clips
+            for name, solver in SOLVERS.items():
+                end = np.clip(solver(self, start), 0.0, 1.0)
+                found[name] = end if self.worst(end) <= self.worst(start) else start
+        return found
 
 
 # ---- solvers ---------------------------------------------------------------------------------

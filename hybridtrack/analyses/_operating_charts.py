@@ -44,7 +44,7 @@ def _ends(design: Design) -> Chart:
         lines.append(Line(one.solver, share, values, steps="pre"))
     all_of_them = np.array([1.0, float(design.settings.starts)])
     level = np.full(2, 1.1 * optimum / scale)
-    lines.append(Line("110 % of the optimum", all_of_them, level, reference=True))
+    lines.append(Line(f"110 % of the {design.best}", all_of_them, level, reference=True))
     caption = f"Objective where {design.settings.starts:,} local starts end, in ascending order"
     panel = Panel("normalised\nworst error", lines, log_y=True)
     return Chart("local_starts", caption, "start", [panel])
@@ -59,5 +59,5 @@ def _shares(design: Design) -> Chart:
         for one in design.study
     ]
     panel = Panel("share of starts", lines, (), [Mark("10 %", x=10.0)], y_limits=(-0.02, 1.02))
-    caption = "Share of local starts that end within a percentage of the optimum"
-    return Chart("share_of_starts", caption, "per cent above the optimum", [panel])
+    caption = f"Share of local starts that end within a percentage of the {design.best}"
+    return Chart("share_of_starts", caption, f"per cent above the {design.best}", [panel])

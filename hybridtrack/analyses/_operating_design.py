@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from hybridtrack.analyses._local_starts import LocalStarts
-from hybridtrack.analyses._procedure import Procedure, Range, Step
+from hybridtrack.analyses._procedure import BEST_FOUND, OPTIMAL, Procedure, Range, Step
 
-WITHOUT, OPTIMAL = "without remainder", "optimal"  # what no other placement is called
+WITHOUT = "without remainder"
+RESERVED = (WITHOUT, OPTIMAL, BEST_FOUND)  # what no other placement is called
 TEN = 10.0  # per cent above the optimum that the paper counts starts within
 
 
@@ -56,8 +57,14 @@ class Design(NamedTuple):
         return self.procedure.system.state_names[self.state]
 
     @property
+    def best(self) -> str:
+        """What the best placements may be called: the optimum only with a certificate."""
+        certain = all(step.placement.certificate for step in self.steps)
+        return "optimum" if certain else "best found"
+
+    @property
     def studied(self) -> float:
-        """The optimum that local starts are held against."""
+        """The best that local starts are held against."""
         return self.steps[self.settings.starts_points - 1].placement.worst_error
 
 

@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hybridtrack.analyses._linearisation import PRINTED
-from hybridtrack.analyses._operating_design import TEN, Design, coarse
+from hybridtrack.analyses._operating_design import RESERVED, TEN, Design, coarse
 
 Row = Mapping[str, Any]
 
 LOOSE = 0.01  # of an error: a certificate that says little
+MOST_DECIMALS = 5
 MOST_SHOWN = 5  # points that a terminal has room for
 
 
@@ -23,7 +24,8 @@ def shown(design: Design, rows: Sequence[Row]) -> dict[str, list[str]]:
         "norm-\nalised": [_short(row["normalised_error"]) if row["points"] else "" for row in rows],
     }
     if len(states) == 1:
-        cells[f"at {states[0]} ="] = [_places(row, states[0]) for row in rows]
+        width = float(design.over.high[0] - design.over.low[0])
+        cells[f"at {states[0]} ="] = [_places(row, states[0], width) for row in rows]
     cells[f"bound\n{name}"] = [_short(row[f"bound_{name}"]) or "none" for row in rows]
     if design.wanted:
         cells["with-\nin"] = [_answer(row) for row in rows]
@@ -33,18 +35,41 @@ def shown(design: Design, rows: Sequence[Row]) -> dict[str, list[str]]:
 def _named(row: Row) -> str:
     if not row["points"]:
         return "noise alone"
-    optimal = row["placement"] == "optimal"
-    return str(row["points"]) if optimal else f"{row['points']}: {row['placement']}"
+    return (
+        str(row["points"])
+        if row["placement"] in RESERVED
+        else f"{row['points']}: {row['placement']}"
+    )
 
 
 def _answer(row: Row) -> str:
     return ("yes" if row["meets_wanted"] else "no") if row["points"] else ""
 
 
-def _places(row: Row, state: str) -> str:
+def _places(row: Row, state: str, width: float) -> str:
     values = [row[f"{state}_{i + 1}"] for i in range(row["points"])]
-    listed = " ".join(f"{value:.3f}" for value in values[:MOST_SHOWN])
+    listed = " ".join(place(value, width) for value in values[:MOST_SHOWN])
     return listed + " ..." * (len(values) > MOST_SHOWN)
+
+
+def place(value: float, width: float) -> str:
+    """To about four digits of the range's width; no minus before what rounds to 0."""
+    decimals = 3 - math.floor(math.log10(width))
+    rounded = round(value, decimals) + 0.0
+    if 0 <= decimals <= MOST_DECIMALS:
+        return f"{rounded:.{decimals}f}"
+    return f"{rounded:.4g}"
+
+
+def _bound(value: float) -> str:
+    return f"{value:.3f}" if 0.1 <= value < 100.0 else f"{value:.4g}"
+
+
+def share(part: float) -> str:
+    """A share of starts to a twentieth; 0 and 100 % only where it is none or all of them."""
+    if 0.0 < part < 1.0 and coarse(part) in (0.0, 1.0):
+        return "under 5 %" if part < 0.5 else "over 95 %"
+    return f"{100 * coarse(part):.0f} %"
 
 
 def _short(value: float | None) -> str:
@@ -71,23 +96,27 @@ def conclusions(design: Design, rows: Sequence[Row]) -> list[str]:
 def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
     name = design.state_name
     alone = rows[0][f"bound_{name}"]
-    leave = f"noise alone leaves {alone:.3f}"
-    bounds = {row["points"]: row[f"bound_{name}"] for row in rows if row["placement"] == "optimal"}
+    leave = f"noise alone leaves {_bound(alone)}"
+    bounds = {
+        row["points"]: row[f"bound_{name}"] for row in rows if row["placement"] in RESERVED[1:]
+    }
     most = max(bounds)
     if not design.wanted:
         listed = ", ".join(
-            f"{bound:.3f} with {count}" for count, bound in bounds.items() if bound is not None
+            f"{_bound(bound)} with {count}" for count, bound in bounds.items() if bound is not None
         )
         if not listed:
             return [f"With up to {_count(most)} the bound on {name} has no steady state; {leave}."]
-        return [f"The bound on {name} settles at {listed} points; {leave}."]
+        settled = [count for count, bound in bounds.items() if bound is not None]
+        plural = "s" * (settled[-1] != 1)
+        return [f"The bound on {name} settles at {listed} point{plural}; {leave}."]
     wanted = " and ".join(
         f"{design.procedure.system.state_names[j]} within {bound:g}"
         for j, bound in design.wanted.items()
     )
     if design.needed is None:
         last = bounds[most]
-        settles = "has no steady state" if last is None else f"settles at {last:.3f}"
+        settles = "has no steady state" if last is None else f"settles at {_bound(last)}"
         return [
             f"Even {_count(most)} don't keep {wanted}: with them the bound on {name} {settles}; "
             f"{leave}."
@@ -95,11 +124,11 @@ def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
     few, verb = ("One point", "is") if design.needed == 1 else (_count(design.needed), "are")
     said_first = (
         f"{few} {verb} enough for {wanted}: the bound on {name} "
-        f"settles at {bounds[design.needed]:.3f}; {leave}."
+        f"settles at {_bound(bounds[design.needed])}; {leave}."
     )
     fewer = bounds.get(design.needed - 1)
     if design.needed > 1:
-        was = "has none" if fewer is None else f"is {fewer:.3f}"
+        was = "has none" if fewer is None else f"is {_bound(fewer)}"
         said_first = said_first[:-1] + f", and with one point fewer it {was}."
     return [said_first]
 
@@ -120,7 +149,13 @@ def _how_far(design: Design) -> list[str]:
             return [f"{sentence}; other places may be better by up to {100.0 * gap:.0f} % of it."]
         return [f"{sentence}; no other places are better by {_percent(gap)} of it."]
     doubt = next(step.placement.doubt for step in reversed(steps) if step.placement.doubt)
-    return [f"{sentence}; that no other places are better is not certified ({doubt})."]
+    where = ""
+    if len(design.procedure.function.states) > 1:
+        where = " Where the points stand is in points.parquet."
+    return [
+        f"{sentence}: the best found; that no other places are better is not certified "
+        f"({doubt}).{where}"
+    ]
 
 
 def _others(design: Design) -> list[str]:
@@ -129,7 +164,8 @@ def _others(design: Design) -> list[str]:
         count = len(step.placement.points)
         if count <= len(design.steps):
             best = design.steps[count - 1].placement.worst_error
-            more = 100.0 * (step.placement.worst_error / best - 1.0)
+            # of the same points, looked at by another search, rounding is left
+            more = max(100.0 * (step.placement.worst_error / best - 1.0), 0.0)
             parts.append(f"'{step.name}' by {more:.0f} %")
     if not parts:
         return []
@@ -143,13 +179,12 @@ def _local(design: Design) -> list[str]:
         return []
     optimum = design.studied
     shares = ", ".join(
-        f"{100 * coarse(one.share_within(TEN, optimum)):.0f} % by {one.solver}"
-        for one in design.study
+        f"{share(one.share_within(TEN, optimum))} by {one.solver}" for one in design.study
     )
     return [
         f"Of {design.settings.starts:,} random starts, "
         f"with {_count(design.settings.starts_points)}, "
-        f"within 10 % of the optimum end about {shares}: the solver decides."
+        f"within 10 % of the {design.best} end about {shares}: the solver decides."
     ]
 
 

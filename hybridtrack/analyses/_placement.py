@@ -1,5 +1,7 @@
 """Where to linearise, in one varied state: the smallest largest error, to the global optimum.
 
+Where a second derivative changes its sign, the best that a global search finds instead.
+
 Placing N points so that the worst place of a range is served best is a covering problem. At a given
 level of error each place x is served by an interval of points; walking from the left and setting
 each point as far right as the leftmost unserved place allows needs the fewest points of all (the
@@ -9,13 +11,21 @@ greedy piercing of intervals). So a bisection on the level finds the optimum of 
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridtrack.analyses._enclosures import largest_size
-from hybridtrack.analyses._linearisation import EXACT, Nonlinear, lattice, of_bank
+from hybridtrack.analyses._linearisation import (
+    EXACT,
+    Nonlinear,
+    lattice,
+    of_bank,
+    on_places,
+    worst_of,
+)
+from hybridtrack.analyses._objective import Scaled
 from hybridtrack.models import Array
 
 CELLS = 65_536  # of the range; the certificate's gap is about the error times 3/CELLS
@@ -23,6 +33,9 @@ ENCLOSED = 128  # intervals that fourth derivatives are enclosed over
 SIGNS = 4096  # cells that a second derivative's sign is looked up at
 ROUNDING = 1e-12  # of its largest value: what has no sign
 HALVINGS = 60
+BISECTIONS = 50  # of a place: to 1e-15 of what is left of the range
+RESTARTS, GENERATIONS, POPULATION = 3, 80, 60  # of differential evolution
+SEARCHED = 401  # places that it judges candidates at
 CHECKED = 20_001  # places that an error is looked up at
 
 CERTIFICATE = "greedy covering, bisected"
@@ -41,10 +54,21 @@ class Placement(NamedTuple):
     doubt: str = ""  # why it may not be the optimum
 
 
-def place_one(function: Nonlinear, kind: str, low: float, high: float, count: int) -> Placement:
-    """The best `count` points in [low, high] for a function of one state."""
+def place_one(
+    function: Nonlinear,
+    kind: str,
+    low: float,
+    high: float,
+    count: int,
+    seed: int = 0,
+    others: Sequence[Array] = (),
+) -> Placement:
+    """The best `count` points in [low, high] for a function of one state.
+
+    others (each (count, 1)): points that a search, where nothing is certain, may do no worse than.
+    """
     if kind == EXACT:
-        return _place_exact(function, low, high, count)
+        return _place_exact(function, low, high, count, seed, others)
     return _place_printed(function, kind, low, high, count)
 
 
@@ -199,8 +223,17 @@ def majorant(function: Nonlinear, low: float, high: float) -> Majorant:
         kept = np.flatnonzero(own)
         changes = kept[:-1][own[kept[:-1]] != own[kept[1:]]]
         follow = kept[1:][own[kept[:-1]] != own[kept[1:]]]
+        fine = min(2e-12, 1e-13 * (high - low))
         roots = [
-            float(brentq(lambda x, j=j: function.hessian(np.array([[x]]))[0, j, 0, 0], a, b))
+            float(
+                brentq(
+                    lambda x, j=j: function.hessian(np.array([[x]]))[0, j, 0, 0],
+                    *(a, b),
+                    xtol=fine,
+                    full_output=True,
+                    disp=False,
+                )[0]
+            )
             for a, b in zip(nodes[changes], nodes[follow], strict=True)
         ]
         starts.append(np.array([low, *roots]))
@@ -228,13 +261,40 @@ def _farthest(error: Callable[[float], float], start: float, high: float, level:
 
     if error(high) <= level:
         return high
-    return float(brentq(lambda x: error(x) - level, start, high, xtol=1e-14, rtol=1e-14))
+    fine = min(1e-14, 1e-13 * (high - start))
+    place, answer = brentq(
+        lambda x: error(x) - level,
+        *(start, high),
+        xtol=fine,
+        rtol=1e-14,
+        full_output=True,
+        disp=False,
+    )
+    return float(place) if answer.converged else _halved(error, start, high, level)
 
 
-def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Placement:
+def _halved(error: Callable[[float], float], served: float, unserved: float, level: float) -> float:
+    """By bisection, which an error that rounding makes rough doesn't hold up."""
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (served + unserved)
+        if error(middle) <= level:
+            served = middle
+        else:
+            unserved = middle
+    return served
+
+
+def _place_exact(
+    function: Nonlinear,
+    low: float,
+    high: float,
+    count: int,
+    seed: int = 0,
+    others: Sequence[Array] = (),
+) -> Placement:
     bound = majorant(function, low, high)
     highest = bound.error(low, high) + bound.error(high, low)
-    below, level, points = smallest_level(lambda q: _walk(bound, low, high, q, count), highest)
+    below, _, points = smallest_level(lambda q: _walk(bound, low, high, q, count), highest)
     chosen = _filled(points, count)
     worst = worst_of_one(function, EXACT, low, high, chosen)
     changing = [
@@ -244,15 +304,52 @@ def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Pl
     ]
     if changing:
         doubt = (
-            f"the curvature of {' and '.join(changing)} changes its sign in the range: placed by a "
-            f"bound of the error ({level:.4g}), which is the error itself only where it doesn't"
+            f"the curvature of {' and '.join(changing)} changes its "
+            f"sign in the range; the best of a bound's points, of {RESTARTS} starts of a global "
+            "search and of local solvers"
         )
-        return Placement(chosen, worst, math.nan, "", doubt)
+        searched = _searched(function, low, high, count, seed)
+        return best_of(function, (low, high), [chosen, *searched, *others], doubt)
     slack = _unseen(function, low, high)
     if math.isinf(slack):
         return Placement(chosen, worst, math.nan, "", NOT_ENCLOSED)
     below = max(below - slack, 0.0)
     return Placement(chosen, max(worst, below), below, CERTIFICATE, "")
+
+
+def _searched(function: Nonlinear, low: float, high: float, count: int, seed: int) -> list[Array]:
+    """Where differential evolution ends, on the error itself, and local solvers from there."""
+    from scipy.optimize import differential_evolution
+
+    width = high - low
+    judge = on_places(function, EXACT, lattice(np.array([low]), np.array([high]), SEARCHED))
+    objective = Scaled(function, EXACT, (np.array([low]), np.array([high])), count)
+    rng = np.random.default_rng([seed, count])
+    answers = []
+    for _ in range(RESTARTS):
+        answer = differential_evolution(
+            lambda c: worst_of(judge(low + width * c[:, np.newaxis])),
+            [(0.0, 1.0)] * count,
+            maxiter=GENERATIONS,
+            popsize=max(POPULATION // count, 5),
+            tol=1e-6,
+            rng=rng,
+            polish=False,
+            init="sobol",
+        )
+        answers.append(answer)
+    best = min(answers, key=lambda one: float(one.fun)).x
+    ends = [*(one.x for one in answers), *objective.ends(best).values()]
+    return [np.clip(low + width * end[:, np.newaxis], low, high) for end in ends]
+
+
+def best_of(
+    function: Nonlinear, ends: tuple[float, float], candidates: Sequence[Array], doubt: str
+) -> Placement:
+    """Whichever candidate (n, 1) has the smallest worst error; the first of equals."""
+    worsts = [worst_of_one(function, EXACT, *ends, one) for one in candidates]
+    best = int(np.argmin(worsts))
+    return Placement(np.sort(candidates[best], axis=0), worsts[best], math.nan, "", doubt)
 
 
 def _unseen(function: Nonlinear, low: float, high: float) -> float:

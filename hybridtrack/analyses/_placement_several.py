@@ -41,9 +41,10 @@ def place_several(
     places = lattice(low, high, PLACES)
     rng = np.random.default_rng([seed, count])
     found = []
-    for _ in range(restarts):
-        points = _evolve(function, kind, places, (low, high), count, rng)
-        found.append(_polish(function, kind, places, (low, high), points))
+    with np.errstate(all="ignore"):  # beside a pole; whoever asks refuses what isn't finite
+        for _ in range(restarts):
+            points = _evolve(function, kind, places, (low, high), count, rng)
+            found.append(_polish(function, kind, places, (low, high), points))
     worst, points = min(found, key=lambda one: one[0])
     points = points[np.lexsort(points.T[::-1])]
     agree = sum(level <= (1.0 + AGREE) * worst for level, _ in found)
@@ -167,13 +168,15 @@ def worst_of_several(
     x = lattice(low, high, CHECKED)
     found = of_bank(function, kind, x, points)
     peak = int(found.argmax())
-    answer = minimize(
-        lambda place: -float(of_bank(function, kind, place[np.newaxis], points)[0]),
-        x[peak],
-        method="Nelder-Mead",
-        bounds=list(zip(low, high, strict=True)),
-        options={"xatol": 1e-9, "fatol": 1e-14, "initial_simplex": _simplex(x[peak], low, high)},
-    )
+    options = {"xatol": 1e-9, "fatol": 1e-14, "initial_simplex": _simplex(x[peak], low, high)}
+    with np.errstate(all="ignore"):  # uphill to a pole
+        answer = minimize(
+            lambda place: -float(of_bank(function, kind, place[np.newaxis], points)[0]),
+            x[peak],
+            method="Nelder-Mead",
+            bounds=list(zip(low, high, strict=True)),
+            options=options,
+        )
     if -answer.fun > found[peak]:
         return -float(answer.fun), np.asarray(answer.x)
     return float(found[peak]), x[peak]

@@ -26,6 +26,7 @@ from hybridtrack.analyses._steady_ellipsoids import Steady, steady, with_box
 from hybridtrack.models import Array
 
 NARROWED, NARROWINGS = 64, 3  # cells that a pole is looked for in, and again in those with one
+OPTIMAL, BEST_FOUND = "optimal", "best found"  # with a certificate, and without
 SAMPLED = 9  # places of the range that the smallest bound is looked for at
 
 
@@ -94,13 +95,18 @@ class Procedure:
         self._measurement = compiled(slopes[1], own, (n_y, n_x))
         self._known: dict[tuple[Any, ...], Steady | None] = {}
 
-    def place(self, over: Range, count: int) -> Placement:
-        """Steps 2 and 3: the best `count` points."""
+    def place(self, over: Range, count: int, others: Sequence[Array] = ()) -> Placement:
+        """Steps 2 and 3: the best `count` points, no worse than others (n, d) of as many."""
+        same = [points for points in others if len(points) == count]
         if len(over.low) == 1:
-            return place_one(
-                self.function, self.kind, float(over.low[0]), float(over.high[0]), count
-            )
-        return place_several(self.function, self.kind, over.low, over.high, count, self.seed)
+            low, high = float(over.low[0]), float(over.high[0])
+            return place_one(self.function, self.kind, low, high, count, self.seed, same)
+        found = place_several(self.function, self.kind, over.low, over.high, count, self.seed)
+        for points in same:
+            worst = self.given(over, points).worst_error
+            if worst < found.worst_error:
+                found = found._replace(points=points, worst_error=worst)
+        return found
 
     def given(self, over: Range, points: Array) -> Placement:
         """The worst error of points (n, d) that someone else chose."""
@@ -170,12 +176,25 @@ class Procedure:
         return Step(name, placement, radius, self.bank(placement.points, radius, rule, state))
 
     def steps(
-        self, over: Range, rule: str, wanted: Mapping[int, float], least: int, most: int
+        self,
+        over: Range,
+        rule: str,
+        wanted: Mapping[int, float],
+        least: int,
+        most: int,
+        others: Sequence[Array] = (),
     ) -> Iterator[Step]:
-        """Steps 2 to 5: until the bounds wanted, by state, are met and `least` points tried."""
+        """Steps 2 to 5: until the bounds wanted, by state, are met and `least` points tried.
+
+        others: points (n, d) of any number, that the best of as many may be no worse than.
+        """
+        before: list[Array] = []
         state = next(iter(wanted), 0)
         for count in range(1, most + 1):
-            step = self.step(over, "optimal", self.place(over, count), rule, state)
+            placement = self.place(over, count, [*before, *others])
+            name = OPTIMAL if placement.certificate else BEST_FOUND
+            step = self.step(over, name, placement, rule, state)
+            before = [np.vstack([placement.points, placement.points[-1:]])]
             yield step
             if count >= least and wanted and self.meets(step, rule, wanted):
                 return

@@ -2,8 +2,9 @@
 
 Otanez, Campbell 2004, section III-B: the bound that noise alone leaves, then 1, 2, ... operating
 points at the places of the smallest largest linearisation error, until the steady ellipsoid is
-within what is wanted. In one state the placement is the global optimum; in several it is the best
-that restarts find. Beside it, what local solvers make of the same problem.
+within what is wanted. In one state the placement is the global optimum where the curvature
+keeps its sign; elsewhere, and in several states, it is the best found. Beside it, what local
+solvers make of the same problem.
 """
 
 import math
@@ -16,7 +17,7 @@ from hybridtrack.analyses import Analysis, Findings, Measured
 from hybridtrack.analyses._local_starts import LocalStarts, local_starts
 from hybridtrack.analyses._operating_charts import charts
 from hybridtrack.analyses._operating_design import (
-    OPTIMAL,
+    RESERVED,
     TEN,
     WITHOUT,
     Design,
@@ -33,7 +34,8 @@ from hybridtrack.analyses._operating_tables import (
     table_of,
 )
 from hybridtrack.analyses._operating_words import conclusions, notes, shown
-from hybridtrack.analyses._procedure import Procedure, Range, System
+from hybridtrack.analyses._placement_several import worst_of_several
+from hybridtrack.analyses._procedure import Procedure, Range, Step, System
 from hybridtrack.analyses._steady_ellipsoids import Steady
 from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
@@ -41,6 +43,7 @@ from hybridtrack.expressions import number
 from hybridtrack.models import Array
 
 MOST_STATES = 3  # that points are placed in
+BEYOND = 1e3  # times what the curvature that was seen allows an error
 
 
 def _analyse(experiment: Experiment, settings: Settings, measured: Measured | None) -> Findings:
@@ -89,25 +92,29 @@ def findings(system: System, settings: Settings, seed: int) -> Findings:
     smallest = _smallest(procedure, over, settings.rule, state, wanted)
     least = max(settings.least_points, settings.starts_points if settings.starts else 1)
     most = max(settings.most_points, least)
-    steps = list(procedure.steps(over, settings.rule, wanted, least, most))
-    given = [
-        procedure.step(over, label, procedure.given(over, points), settings.rule, state)
-        for label, points in _placements(over, settings).items()
-    ]
-    met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
-    needed = met.index(True) + 1 if True in met else None
     study: list[LocalStarts] = []
     if settings.starts:
         count = settings.starts_points
         study = local_starts(
             procedure.function, settings.remainder, *over, count, settings.starts, seed
         )
+    placements = _placements(over, settings)
+    others = [*placements.values(), *(one.points[one.worst_errors.argmin()] for one in study)]
+    steps = list(procedure.steps(over, settings.rule, wanted, least, most, others))
+    given = [
+        procedure.step(over, label, procedure.given(over, points), settings.rule, state)
+        for label, points in placements.items()
+    ]
+    for step in (*steps, *given):
+        _refuse_pole(procedure, over, step)
+    met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
+    needed = met.index(True) + 1 if True in met else None
     rows = [row_of(procedure, over, WITHOUT, None, smallest, state)]
     for step in (*steps, *given):
         row = row_of(procedure, over, step.name, step, step.steady, state)
         if wanted:
             row["meets_wanted"] = procedure.meets(step, settings.rule, wanted)
-        if step.name == OPTIMAL and len(step.placement.points) == settings.starts_points:
+        if step.name in RESERVED and len(step.placement.points) == settings.starts_points:
             for one in study:
                 share = one.share_within(TEN, step.placement.worst_error)
                 row[f"share_within_10_percent_{one.solver}"] = coarse(share)
@@ -207,6 +214,28 @@ def _range(procedure: Procedure, settings: Settings) -> Range:
     return over
 
 
+def _refuse_pole(procedure: Procedure, over: Range, step: Step) -> None:
+    """Where an error has no bound, between the places that were looked at before."""
+    width = float(np.linalg.norm(over.high - over.low))
+    most = BEYOND * procedure.largest_curvature(over) * width**2
+    if step.placement.worst_error <= most:
+        return
+    where = ""
+    if len(over.low) > 1:
+        _, place = worst_of_several(
+            procedure.function, procedure.kind, *over, step.placement.points
+        )
+        names = procedure.function.states
+        listed = ", ".join(f"{s} = {v:.4g}" for s, v in zip(names, place, strict=True))
+        where = f" about {listed}"
+    raise Unsuited(
+        f"the dynamics, or their derivatives, have no bound{where}; choose a range without it",
+        "analyses",
+        "operating_points",
+        "range",
+    )
+
+
 def _those(procedure: Procedure) -> str:
     return f"the remainder depends on {' and '.join(procedure.function.states)}"
 
@@ -288,7 +317,7 @@ def _smallest(
 def _placements(over: Range, settings: Settings) -> dict[str, Array]:
     found, d = {}, len(over.low)
     for label, listed in (settings.placements or {}).items():
-        if label in (WITHOUT, OPTIMAL):
+        if label in RESERVED:
             raise Unsuited(
                 f"a placement can't be called '{label}'; rename it",
                 "analyses",
