@@ -8,9 +8,9 @@ from hybridtrack.analyses import Table
 from hybridtrack.analyses._local_starts import WITHIN_PERCENT
 from hybridtrack.analyses._objective import SOLVERS
 from hybridtrack.analyses._operating_design import WITHOUT, Design
-from hybridtrack.analyses._placement import Placement
 from hybridtrack.analyses._procedure import Procedure, Range, Step
 from hybridtrack.analyses._steady_ellipsoids import NAMES, Steady
+from hybridtrack.analyses._worst_errors import Placement
 
 
 def row_of(

@@ -1,31 +1,23 @@
 """Where to linearise, in one varied state: the smallest largest error, to the global optimum.
 
-Where a second derivative changes its sign, the best that a global search finds instead.
-
 Placing N points so that the worst place of a range is served best is a covering problem. At a given
 level of error each place x is served by an interval of points; walking from the left and setting
 each point as far right as the leftmost unserved place allows needs the fewest points of all (the
 greedy piercing of intervals). So a bisection on the level finds the optimum of eq. 33 of Otanez
-2004, which local solvers miss from most starts.
+2004, which local solvers miss from many starts. The exact error of a function whose second
+derivative changes its sign is served by no interval; there `_placement_search` looks.
 """
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridtrack.analyses._enclosures import largest_size
-from hybridtrack.analyses._linearisation import (
-    EXACT,
-    Nonlinear,
-    lattice,
-    of_bank,
-    on_places,
-    worst_of,
-)
-from hybridtrack.analyses._objective import Scaled
+from hybridtrack.analyses._linearisation import EXACT, Nonlinear
+from hybridtrack.analyses._worst_errors import Placement, worst_error
 from hybridtrack.models import Array
 
 CELLS = 65_536  # of the range; the certificate's gap is about the error times 3/CELLS
@@ -34,9 +26,6 @@ SIGNS = 4096  # cells that a second derivative's sign is looked up at
 ROUNDING = 1e-12  # of its largest value: what has no sign
 HALVINGS = 60
 BISECTIONS = 50  # of a place: to 1e-15 of what is left of the range
-RESTARTS, GENERATIONS, POPULATION = 3, 80, 60  # of differential evolution
-SEARCHED = 401  # places that it judges candidates at
-CHECKED = 20_001  # places that an error is looked up at
 
 CERTIFICATE = "greedy covering, bisected"
 NOT_ENCLOSED = "the fourth derivative has no enclosure, so errors are those of a lattice"
@@ -44,31 +33,15 @@ NOT_ENCLOSED = "the fourth derivative has no enclosure, so errors are those of a
 Cover = Callable[[float], list[float] | None]  # points that serve the range at a level, or None
 
 
-class Placement(NamedTuple):
-    """Points, the worst error of the bank that is linearised there, and what is known of it."""
-
-    points: Array  # (n, d), ascending where d = 1
-    worst_error: float  # over the range, weighted
-    no_less_than: float  # no placement of as many has a smaller one; NaN where that isn't known
-    certificate: str  # what makes it the optimum; empty where nothing does
-    doubt: str = ""  # why it may not be the optimum
-
-
 def place_one(
-    function: Nonlinear,
-    kind: str,
-    low: float,
-    high: float,
-    count: int,
-    seed: int = 0,
-    others: Sequence[Array] = (),
-) -> Placement:
+    function: Nonlinear, kind: str, low: float, high: float, count: int
+) -> Placement | None:
     """The best `count` points in [low, high] for a function of one state.
 
-    others (each (count, 1)): points that a search, where nothing is certain, may do no worse than.
+    None for the exact error of what has a second derivative that changes its sign there.
     """
     if kind == EXACT:
-        return _place_exact(function, low, high, count, seed, others)
+        return _place_exact(function, low, high, count)
     return _place_printed(function, kind, low, high, count)
 
 
@@ -161,7 +134,7 @@ def _place_printed(
     _, _, points = smallest_level(lambda q: pierce(edges, upper, q, count), highest)
     below, _, _ = smallest_level(lambda q: pierce(edges, lower, q, count), highest)
     chosen = _filled(points, count)
-    worst = worst_of_one(function, kind, low, high, chosen)
+    worst, _ = worst_error(function, kind, np.array([low]), np.array([high]), chosen)
     if not certain:
         return Placement(chosen, worst, math.nan, "", NOT_ENCLOSED)
     return Placement(chosen, max(worst, below), below, CERTIFICATE, "")
@@ -284,32 +257,14 @@ def _halved(error: Callable[[float], float], served: float, unserved: float, lev
     return served
 
 
-def _place_exact(
-    function: Nonlinear,
-    low: float,
-    high: float,
-    count: int,
-    seed: int = 0,
-    others: Sequence[Array] = (),
-) -> Placement:
+def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Placement | None:
     bound = majorant(function, low, high)
+    if any(len(starts) > 1 for starts in bound.starts):
+        return None
     highest = bound.error(low, high) + bound.error(high, low)
     below, _, points = smallest_level(lambda q: _walk(bound, low, high, q, count), highest)
     chosen = _filled(points, count)
-    worst = worst_of_one(function, EXACT, low, high, chosen)
-    changing = [
-        name
-        for name, starts in zip(function.components, bound.starts, strict=True)
-        if len(starts) > 1
-    ]
-    if changing:
-        doubt = (
-            f"the curvature of {' and '.join(changing)} changes its "
-            f"sign in the range; the best of a bound's points, of {RESTARTS} starts of a global "
-            "search and of local solvers"
-        )
-        searched = _searched(function, low, high, count, seed)
-        return best_of(function, (low, high), [chosen, *searched, *others], doubt)
+    worst, _ = worst_error(function, EXACT, np.array([low]), np.array([high]), chosen)
     slack = _unseen(function, low, high)
     if math.isinf(slack):
         return Placement(chosen, worst, math.nan, "", NOT_ENCLOSED)
@@ -317,76 +272,27 @@ def _place_exact(
     return Placement(chosen, max(worst, below), below, CERTIFICATE, "")
 
 
-def _searched(function: Nonlinear, low: float, high: float, count: int, seed: int) -> list[Array]:
-    """Where differential evolution ends, on the error itself, and local solvers from there."""
-    from scipy.optimize import differential_evolution
-
-    width = high - low
-    judge = on_places(function, EXACT, lattice(np.array([low]), np.array([high]), SEARCHED))
-    objective = Scaled(function, EXACT, (np.array([low]), np.array([high])), count)
-    rng = np.random.default_rng([seed, count])
-    answers = []
-    for _ in range(RESTARTS):
-        answer = differential_evolution(
-            lambda c: worst_of(judge(low + width * c[:, np.newaxis])),
-            [(0.0, 1.0)] * count,
-            maxiter=GENERATIONS,
-            popsize=max(POPULATION // count, 5),
-            tol=1e-6,
-            rng=rng,
-            polish=False,
-            init="sobol",
-        )
-        answers.append(answer)
-    best = min(answers, key=lambda one: float(one.fun)).x
-    ends = [*(one.x for one in answers), *objective.ends(best).values()]
-    return [np.clip(low + width * end[:, np.newaxis], low, high) for end in ends]
-
-
-def best_of(
-    function: Nonlinear, ends: tuple[float, float], candidates: Sequence[Array], doubt: str
-) -> Placement:
-    """Whichever candidate (n, 1) has the smallest worst error; the first of equals."""
-    worsts = [worst_of_one(function, EXACT, *ends, one) for one in candidates]
-    best = int(np.argmin(worsts))
-    return Placement(np.sort(candidates[best], axis=0), worsts[best], math.nan, "", doubt)
-
-
 def _unseen(function: Nonlinear, low: float, high: float) -> float:
     """How far E may be above the error by changes of sign between two places that were looked at.
 
-    There f'' is no farther beyond 0 than max |f''''| h^2/8, or than what was taken for rounding,
-    and E exceeds the error by twice its integral over at most the range.
+    In a cell f'' is beyond 0 by no more than max |f''''| h^2/8 less its distance from 0 at the
+    cell's ends; what was taken for rounding may have any sign. E exceeds the error by at most twice
+    the integral of what is beyond 0, times the range: nothing where f'' keeps away from 0.
     """
     edges = np.linspace(low, high, SIGNS + 1)
     bend, certain = _bends(function, edges)
     if not certain:
         return math.inf
-    curvature = np.abs(function.hessian(edges[:, np.newaxis])[:, :, 0, 0]).max(axis=0)
-    depth = bend.max(axis=0) * ((high - low) / SIGNS) ** 2 / 8.0
-    return float((depth + ROUNDING * curvature * function.weights).max()) * (high - low) ** 2
-
-
-# ---- both ------------------------------------------------------------------------------------
+    curvature = function.hessian(edges[:, np.newaxis])[:, :, 0, 0] * function.weights
+    one, other = curvature[:-1], curvature[1:]
+    faint = ROUNDING * np.abs(curvature).max(axis=0)
+    distance = np.where(one * other > 0.0, np.minimum(np.abs(one), np.abs(other)), 0.0)
+    width = (high - low) / SIGNS
+    beyond = np.maximum(bend * width**2 / 8.0 - np.where(distance > faint, distance, 0.0), 0.0)
+    beyond += np.where(np.minimum(np.abs(one), np.abs(other)) <= faint, faint, 0.0)
+    return float(2.0 * (beyond.sum(axis=0) * width).max()) * (high - low)
 
 
 def _filled(points: list[float], count: int) -> Array:
     """As many points as asked for: where fewer serve as well, the last one again."""
     return np.array(points + points[-1:] * (count - len(points)))[:, np.newaxis]
-
-
-def worst_of_one(function: Nonlinear, kind: str, low: float, high: float, points: Array) -> float:
-    """The largest error over the range, of a fine lattice with what lies between its best cells."""
-    from scipy.optimize import minimize_scalar
-
-    x = lattice(np.array([low]), np.array([high]), CHECKED)
-    found = of_bank(function, kind, x, points)
-    peak = int(found.argmax())
-    begin, end = x[max(peak - 1, 0), 0], x[min(peak + 1, len(x) - 1), 0]
-    best = minimize_scalar(
-        lambda place: -float(of_bank(function, kind, np.array([[place]]), points)[0]),
-        bounds=(begin, end),
-        method="bounded",
-        options={"xatol": 1e-12},
-    )
-    return max(float(found[peak]), -float(best.fun))

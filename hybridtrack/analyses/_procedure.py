@@ -20,9 +20,10 @@ from hybridtrack.analyses._linearisation import (
     of_bank,
     radii,
 )
-from hybridtrack.analyses._placement import CHECKED, Placement, place_one, worst_of_one
-from hybridtrack.analyses._placement_several import place_several, worst_of_several
+from hybridtrack.analyses._placement import place_one
+from hybridtrack.analyses._placement_search import search
 from hybridtrack.analyses._steady_ellipsoids import Steady, steady, with_box
+from hybridtrack.analyses._worst_errors import Placement, checked, worst_error
 from hybridtrack.models import Array
 
 NARROWED, NARROWINGS = 64, 3  # cells that a pole is looked for in, and again in those with one
@@ -96,30 +97,27 @@ class Procedure:
         self._known: dict[tuple[Any, ...], Steady | None] = {}
 
     def place(self, over: Range, count: int, others: Sequence[Array] = ()) -> Placement:
-        """Steps 2 and 3: the best `count` points, no worse than others (n, d) of as many."""
-        same = [points for points in others if len(points) == count]
+        """Steps 2 and 3: the best `count` points.
+
+        Where that is a search, it starts from others too, (n, d) of as many or of one fewer, and is
+        no worse than those of as many.
+        """
         if len(over.low) == 1:
             low, high = float(over.low[0]), float(over.high[0])
-            return place_one(self.function, self.kind, low, high, count, self.seed, same)
-        found = place_several(self.function, self.kind, over.low, over.high, count, self.seed)
-        for points in same:
-            worst = self.given(over, points).worst_error
-            if worst < found.worst_error:
-                found = found._replace(points=points, worst_error=worst)
-        return found
+            found = place_one(self.function, self.kind, low, high, count)
+            if found is not None:
+                return found
+        known = [points for points in others if count - 1 <= len(points) <= count]
+        return search(self.function, self.kind, *over, count, self.seed, known)
 
     def given(self, over: Range, points: Array) -> Placement:
         """The worst error of points (n, d) that someone else chose."""
-        if len(over.low) == 1:
-            low, high = float(over.low[0]), float(over.high[0])
-            worst = worst_of_one(self.function, self.kind, low, high, points)
-        else:
-            worst, _ = worst_of_several(self.function, self.kind, over.low, over.high, points)
+        worst, _ = worst_error(self.function, self.kind, *over, points)
         return Placement(points, worst, float("nan"), "")
 
     def radius(self, over: Range, placement: Placement) -> Array:
         """The worst error (k,) of each component; the largest is the placement's own."""
-        x = lattice(over.low, over.high, CHECKED)
+        x = checked(*over)
         found = radii(self.function, self.kind, x, placement.points)
         # what lies between the places of the lattice
         scale = placement.worst_error / max(float((found * self.function.weights).max()), 1e-300)
@@ -132,7 +130,7 @@ class Procedure:
 
     def largest_curvature(self, over: Range) -> float:
         """The largest second derivative in the range, weighted."""
-        return largest_curvature(self.function, lattice(over.low, over.high, CHECKED))
+        return largest_curvature(self.function, checked(*over))
 
     def bank(self, points: Array, radius: Array | None, rule: str, state: int) -> Steady | None:
         """The steady ellipsoid of the model with the widest bound on a state; None if one has none.
@@ -188,13 +186,13 @@ class Procedure:
 
         others: points (n, d) of any number, that the best of as many may be no worse than.
         """
-        before: list[Array] = []
+        before: list[Array] = []  # of one point fewer
         state = next(iter(wanted), 0)
         for count in range(1, most + 1):
             placement = self.place(over, count, [*before, *others])
             name = OPTIMAL if placement.certificate else BEST_FOUND
             step = self.step(over, name, placement, rule, state)
-            before = [np.vstack([placement.points, placement.points[-1:]])]
+            before = [placement.points]
             yield step
             if count >= least and wanted and self.meets(step, rule, wanted):
                 return
@@ -209,7 +207,7 @@ class Procedure:
 
     def not_finite(self, over: Range) -> Array | None:
         """A place (d,) of the range where the function or a derivative has no value, if any."""
-        x = lattice(over.low, over.high, CHECKED)
+        x = checked(*over)
         parts: Sequence[Array] = (
             self.function.value(x),
             self.function.jacobian(x).reshape(len(x), -1),
@@ -243,7 +241,7 @@ class Procedure:
 
 def profile(procedure: Procedure, over: Range, points: Array, state: int) -> tuple[Array, Array]:
     """The bank's error along one state of the range, worst over the others: places and errors."""
-    x = lattice(over.low, over.high, CHECKED // 20 if len(over.low) == 1 else CHECKED)
+    x = lattice(*over, 1_001) if len(over.low) == 1 else checked(*over)
     found = of_bank(procedure.function, procedure.kind, x, points)
     along, owner = np.unique(x[:, state], return_inverse=True)
     worst = np.zeros(len(along))

@@ -34,9 +34,9 @@ from hybridtrack.analyses._operating_tables import (
     table_of,
 )
 from hybridtrack.analyses._operating_words import conclusions, notes, shown
-from hybridtrack.analyses._placement_several import worst_of_several
 from hybridtrack.analyses._procedure import Procedure, Range, Step, System
 from hybridtrack.analyses._steady_ellipsoids import Steady
+from hybridtrack.analyses._worst_errors import worst_error
 from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
 from hybridtrack.expressions import number
@@ -222,9 +222,7 @@ def _refuse_pole(procedure: Procedure, over: Range, step: Step) -> None:
         return
     where = ""
     if len(over.low) > 1:
-        _, place = worst_of_several(
-            procedure.function, procedure.kind, *over, step.placement.points
-        )
+        _, place = worst_error(procedure.function, procedure.kind, *over, step.placement.points)
         names = procedure.function.states
         listed = ", ".join(f"{s} = {v:.4g}" for s, v in zip(names, place, strict=True))
         where = f" about {listed}"
