@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 from hybridtrack.analyses._local_starts import LocalStarts
 from hybridtrack.analyses._procedure import BEST_FOUND, OPTIMAL, Procedure, Range, Step
 
+PAPER = "Otanez, Campbell 2004"
 WITHOUT = "without remainder"
 RESERVED = (WITHOUT, OPTIMAL, BEST_FOUND)  # what no other placement is called
 TEN = 10.0  # per cent above the optimum that the paper counts starts within
@@ -50,6 +51,7 @@ class Design(NamedTuple):
     study: Sequence[LocalStarts]
     needed: int | None  # the fewest points that meet what is wanted
     settings: Settings
+    of_paper: bool  # whether the scenario is the paper's own
 
     @property
     def state_name(self) -> str:
@@ -69,8 +71,7 @@ class Design(NamedTuple):
 
 
 def coarse(share: float) -> float:
-    """A share of starts to a twentieth: another machine's last bits send some starts elsewhere.
-
-    shares.parquet has it as it is.
+    """A share of starts to a fifth: it depends on the draw, and another machine's last bits send
+    some starts elsewhere. shares.parquet has it as it is.
     """
-    return round(20.0 * share) / 20.0
+    return round(5.0 * share) / 5.0

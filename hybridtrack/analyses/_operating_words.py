@@ -4,42 +4,36 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hybridtrack.analyses._linearisation import PRINTED
-from hybridtrack.analyses._operating_design import RESERVED, TEN, Design, coarse
+from hybridtrack.analyses._linearisation import PRINTED, lattice
+from hybridtrack.analyses._operating_design import PAPER, RESERVED, TEN, Design, coarse
+from hybridtrack.analyses._operating_tables import named, place
+from hybridtrack.analyses._procedure import TRIED
+from hybridtrack.analyses._worst_errors import Placement
 
 Row = Mapping[str, Any]
 
 LOOSE = 0.01  # of an error: a certificate that says little
-MOST_DECIMALS = 5
 MOST_SHOWN = 5  # points that a terminal has room for
 
 
 def shown(design: Design, rows: Sequence[Row]) -> dict[str, list[str]]:
     """What a terminal shows: a line for each placement."""
-    name = design.state_name
+    all_names = design.procedure.system.state_names
+    names = [all_names[j] for j in design.wanted] or [design.state_name]
     states = design.procedure.function.states
     cells = {
-        "points": [_named(row) for row in rows],
+        "points": [named(row["placement"], row["points"]) for row in rows],
         "worst\nerror": [_short(row["worst_error"]) if row["points"] else "" for row in rows],
         "norm-\nalised": [_short(row["normalised_error"]) if row["points"] else "" for row in rows],
     }
     if len(states) == 1:
         width = float(design.over.high[0] - design.over.low[0])
         cells[f"at {states[0]} ="] = [_places(row, states[0], width) for row in rows]
-    cells[f"bound\n{name}"] = [_short(row[f"bound_{name}"]) or "none" for row in rows]
+    for name in names:
+        cells[f"bound\n{name}"] = [_short(row[f"bound_{name}"]) or "none" for row in rows]
     if design.wanted:
         cells["with-\nin"] = [_answer(row) for row in rows]
     return cells
-
-
-def _named(row: Row) -> str:
-    if not row["points"]:
-        return "noise alone"
-    return (
-        str(row["points"])
-        if row["placement"] in RESERVED
-        else f"{row['points']}: {row['placement']}"
-    )
 
 
 def _answer(row: Row) -> str:
@@ -52,23 +46,14 @@ def _places(row: Row, state: str, width: float) -> str:
     return listed + " ..." * (len(values) > MOST_SHOWN)
 
 
-def place(value: float, width: float) -> str:
-    """To about four digits of the range's width; no minus before what rounds to 0."""
-    decimals = 3 - math.floor(math.log10(width))
-    rounded = round(value, decimals) + 0.0
-    if 0 <= decimals <= MOST_DECIMALS:
-        return f"{rounded:.{decimals}f}"
-    return f"{rounded:.4g}"
-
-
 def _bound(value: float) -> str:
     return f"{value:.3f}" if 0.1 <= value < 100.0 else f"{value:.4g}"
 
 
 def share(part: float) -> str:
-    """A share of starts to a twentieth; 0 and 100 % only where it is none or all of them."""
+    """A share of starts to a fifth; 0 and 100 % only where it is none or all of them."""
     if 0.0 < part < 1.0 and coarse(part) in (0.0, 1.0):
-        return "under 5 %" if part < 0.5 else "over 95 %"
+        return "under 10 %" if part < 0.5 else "over 90 %"
     return f"{100 * coarse(part):.0f} %"
 
 
@@ -139,23 +124,32 @@ def _how_far(design: Design) -> list[str]:
     sentence = f"The worst linearisation error is {first.worst_error:.4g} with one point"
     if len(steps) > 1:
         sentence += f" and {last.worst_error:.4g} with {len(steps)}"
+    gaps = [_gap(step.placement) for step in (steps[0], steps[-1])]
     if all(step.placement.certificate for step in steps):
-        gap = max(
-            1.0 - step.placement.no_less_than / step.placement.worst_error
-            for step in steps
-            if step.placement.worst_error > 0.0
-        )
+        gap = max(_gap(step.placement) for step in steps)
         if gap > LOOSE:  # a range of so many waves that the cells are too wide
-            return [f"{sentence}; other places may be better by up to {100.0 * gap:.0f} % of it."]
+            return [f"{sentence}; other places may be better by up to {_up(gap)} of it."]
         return [f"{sentence}; no other places are better by {_percent(gap)} of it."]
     doubt = next(step.placement.doubt for step in reversed(steps) if step.placement.doubt)
-    where = ""
-    if len(design.procedure.function.states) > 1:
-        where = " Where the points stand is in points.parquet."
-    return [
-        f"{sentence}: the best found; that no other places are better is not certified "
-        f"({doubt}).{where}"
-    ]
+    said_first = f"{sentence}: the best found, not certified ({doubt})."
+    if any(map(math.isnan, gaps)):
+        return [f"{said_first} How much better other places may be is not known."]
+    found = f"by up to {_up(gaps[0])} of it"
+    if len(steps) > 1:
+        found += f" with one point, {_up(gaps[1])} with {len(steps)}"
+    return [f"{said_first} Other places may be better {found} (a bound by linear programming)."]
+
+
+def _gap(placement: Placement) -> float:
+    """The part of a worst error that other places may take away at most; NaN: not known."""
+    if not placement.worst_error > 0.0:
+        return 0.0
+    return max(1.0 - placement.no_less_than / placement.worst_error, 0.0)
+
+
+def _up(part: float) -> str:
+    """Whole per cents, rounded up."""
+    return f"{math.ceil(100.0 * part - 1e-9):.0f} %"
 
 
 def _others(design: Design) -> list[str]:
@@ -184,7 +178,7 @@ def _local(design: Design) -> list[str]:
     return [
         f"Of {design.settings.starts:,} random starts, "
         f"with {_count(design.settings.starts_points)}, "
-        f"within 10 % of the {design.best} end about {shares}: the solver decides."
+        f"within 10 % of the {design.best} end, to the nearest fifth, {shares}: the solver decides."
     ]
 
 
@@ -192,15 +186,28 @@ def _local(design: Design) -> list[str]:
 
 
 def notes(design: Design) -> list[str]:
-    """What the paper prints wrongly or leaves open, and what was assumed."""
-    said_first = (
+    """What was assumed; of the paper's own scenario also what is wrong in print or left open."""
+    found = _of_the_paper(design) if design.of_paper else _of_another(design)
+    tried = len(lattice(*design.over, TRIED))
+    found.append(
+        f"noise alone: linearised where its bound is the smallest, of {tried} places of the range "
+        "and, where they differ, of as many about the best"
+    )
+    if len(design.procedure.function.components) > 1 and not design.settings.weights:
+        listed = ", ".join(design.procedure.function.components)
+        found.append(f"errors of {listed} are compared as they stand; see 'weights'")
+    return found
+
+
+def _of_the_paper(design: Design) -> list[str]:
+    errors = (
         "errors as (40) prints them: the curvature at the state and no half, where (31) has it at "
         "the point; neither is a bound at every place, `remainder: exact` is"
         if design.settings.remainder == PRINTED
         else "errors are |f(x) - f(c) - f'(c) (x - c)|; (40) of the paper is no bound of them"
     )
-    found = [
-        said_first,
+    return [
+        errors,
         "normalised: by the largest curvature in the range (T v1 in the paper, which gives .129 so "
         "and .006 as it is)",
         "one model serves all components at a place; (32) lets each take its own, as no bank can",
@@ -209,7 +216,20 @@ def notes(design: Design) -> list[str]:
         f"beta and rho by {design.settings.rule}; the paper names no rule, and what is steady "
         "depends on it (rules.parquet)",
     ]
-    if len(design.procedure.function.components) > 1 and not design.settings.weights:
-        listed = ", ".join(design.procedure.function.components)
-        found.append(f"errors of {listed} are compared as they stand; see 'weights'")
-    return found
+
+
+def _of_another(design: Design) -> list[str]:
+    errors = (
+        f"errors as {PAPER} prints them, |(x - c)' f''(x) (x - c)|: no bound at every place, "
+        "`remainder: exact` is"
+        if design.settings.remainder == PRINTED
+        else "errors are |f(x) - f(c) - f'(c) (x - c)|"
+    )
+    return [
+        errors,
+        "normalised: by the largest curvature in the range",
+        "one model serves all components at a place",
+        "a bank's bound is its widest model's, with the worst error of each component everywhere",
+        f"ellipsoids are weighed by {design.settings.rule}; what is steady depends on the rule "
+        "(rules.parquet)",
+    ]

@@ -22,13 +22,14 @@ from hybridtrack.analyses._linearisation import (
 )
 from hybridtrack.analyses._placement import place_one
 from hybridtrack.analyses._placement_search import search
-from hybridtrack.analyses._steady_ellipsoids import Steady, steady, with_box
+from hybridtrack.analyses._steady_ellipsoids import BEST_CONSTANTS, Steady, steady, with_box
 from hybridtrack.analyses._worst_errors import Placement, checked, worst_error
 from hybridtrack.models import Array
 
 NARROWED, NARROWINGS = 64, 3  # cells that a pole is looked for in, and again in those with one
 OPTIMAL, BEST_FOUND = "optimal", "best found"  # with a certificate, and without
-SAMPLED = 9  # places of the range that the smallest bound is looked for at
+TRIED = 9  # places of the range that the smallest bound is looked for at, and about the best again
+ALIKE = 1e-6  # relative: bounds that don't depend on the place
 
 
 class System(NamedTuple):
@@ -145,11 +146,19 @@ class Procedure:
     def smallest(self, over: Range, rule: str, state: int) -> Steady | None:
         """Step 1: without remainder, linearised where in the range the bound is the smallest.
 
-        None where there is none anywhere.
+        Of a few places, and of as many about the best of them. None where there is none at any.
         """
-        places = lattice(over.low, over.high, SAMPLED)
-        found = [one for one in self._each(places, None, rule, state) if one is not None]
-        return min(found, key=lambda one: float(one.half_widths[state]), default=None)
+        places = lattice(*over, TRIED)
+        found = list(self._each(places, None, rule, state))
+        bounds = [np.inf if one is None else float(one.half_widths[state]) for one in found]
+        best = int(np.argmin(bounds))
+        if np.isfinite(bounds[best]) and max(bounds) > (1.0 + ALIKE) * bounds[best]:
+            step = (over.high - over.low) / (round(len(places) ** (1.0 / len(over.low))) - 1)
+            low = np.maximum(places[best] - step, over.low)
+            high = np.minimum(places[best] + step, over.high)
+            found += self._each(lattice(low, high, TRIED), None, rule, state)
+        kept = [one for one in found if one is not None]
+        return min(kept, key=lambda one: float(one.half_widths[state]), default=None)
 
     def _each(
         self, points: Array, radius: Array | None, rule: str, state: int
@@ -163,7 +172,8 @@ class Procedure:
         Q = with_box(system.process_noise, whole[:n_x])
         R = with_box(system.measurement_noise, whole[n_x:])
         for A, C in zip(self._dynamics(points), self._measurement(points), strict=True):
-            key = (A.tobytes(), C.tobytes(), Q.tobytes(), R.tobytes(), rule, state)
+            own = state if rule == BEST_CONSTANTS else 0  # what the others weigh has no state
+            key = (A.tobytes(), C.tobytes(), Q.tobytes(), R.tobytes(), rule, own)
             if key not in self._known:
                 self._known[key] = steady(A, C, Q, R, rule, state)
             yield self._known[key]

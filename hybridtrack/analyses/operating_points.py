@@ -3,8 +3,8 @@
 Otanez, Campbell 2004, section III-B: the bound that noise alone leaves, then 1, 2, ... operating
 points at the places of the smallest largest linearisation error, until the steady ellipsoid is
 within what is wanted. In one state the placement is the global optimum where the curvature
-keeps its sign; elsewhere, and in several states, it is the best found. Beside it, what local
-solvers make of the same problem.
+keeps its sign; elsewhere, and in several states, the best found, with a lower bound. Beside it,
+what local solvers make of the same problem.
 """
 
 import math
@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from hybridtrack.analyses import Analysis, Findings, Measured
+from hybridtrack.analyses._linearisation import lattice
 from hybridtrack.analyses._local_starts import LocalStarts, local_starts
 from hybridtrack.analyses._operating_charts import charts
 from hybridtrack.analyses._operating_design import (
+    PAPER,
     RESERVED,
     TEN,
     WITHOUT,
@@ -34,8 +36,7 @@ from hybridtrack.analyses._operating_tables import (
     table_of,
 )
 from hybridtrack.analyses._operating_words import conclusions, notes, shown
-from hybridtrack.analyses._procedure import Procedure, Range, Step, System
-from hybridtrack.analyses._steady_ellipsoids import Steady
+from hybridtrack.analyses._procedure import TRIED, Procedure, Range, Step, System
 from hybridtrack.analyses._worst_errors import worst_error
 from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
@@ -47,7 +48,7 @@ BEYOND = 1e3  # times what the curvature that was seen allows an error
 
 
 def _analyse(experiment: Experiment, settings: Settings, measured: Measured | None) -> Findings:
-    return findings(system_of(experiment), settings, experiment.seed)
+    return findings(system_of(experiment), settings, experiment.seed, PAPER in experiment.source)
 
 
 def system_of(experiment: Experiment) -> System:
@@ -82,14 +83,14 @@ def system_of(experiment: Experiment) -> System:
     )
 
 
-def findings(system: System, settings: Settings, seed: int) -> Findings:
-    """All of it for a system. Raises Unsuited."""
+def findings(system: System, settings: Settings, seed: int, of_paper: bool = False) -> Findings:
+    """All of it for a system; of_paper: whose equations notes may name. Raises Unsuited."""
     weights = _weights(system, settings)
     procedure = Procedure(system, settings.remainder, weights, seed)
     over = _range(procedure, settings)
     wanted = _wanted(system, settings)
     state = next(iter(wanted), system.state_names.index(procedure.function.states[0]))
-    smallest = _smallest(procedure, over, settings.rule, state, wanted)
+    _refuse_unattainable(procedure, over, settings.rule, state, wanted)
     least = max(settings.least_points, settings.starts_points if settings.starts else 1)
     most = max(settings.most_points, least)
     study: list[LocalStarts] = []
@@ -109,9 +110,9 @@ def findings(system: System, settings: Settings, seed: int) -> Findings:
         _refuse_pole(procedure, over, step)
     met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
     needed = met.index(True) + 1 if True in met else None
-    rows = [row_of(procedure, over, WITHOUT, None, smallest, state)]
+    rows = [row_of(procedure, over, WITHOUT, None, settings.rule, state)]
     for step in (*steps, *given):
-        row = row_of(procedure, over, step.name, step, step.steady, state)
+        row = row_of(procedure, over, step.name, step, settings.rule, state)
         if wanted:
             row["meets_wanted"] = procedure.meets(step, settings.rule, wanted)
         if step.name in RESERVED and len(step.placement.points) == settings.starts_points:
@@ -123,13 +124,13 @@ def findings(system: System, settings: Settings, seed: int) -> Findings:
         row["points_needed"] = needed
     if wanted:
         rows[0]["meets_wanted"] = True
-    design = Design(procedure, over, wanted, state, steps, given, study, needed, settings)
+    design = Design(procedure, over, wanted, state, steps, given, study, needed, settings, of_paper)
     return Findings(
         table=table_of(rows, columns(procedure, design))._replace(shown=shown(design, rows)),
         conclusions=conclusions(design, rows),
         notes=notes(design),
         tables={
-            "rules": rules(design, smallest),
+            "rules": rules(design),
             "points": points(design),
             "local_starts": ends(design),
             "shares": shares(design),
@@ -281,20 +282,20 @@ def _wanted(system: System, settings: Settings) -> dict[int, float]:
     return wanted
 
 
-def _smallest(
+def _refuse_unattainable(
     procedure: Procedure,
     over: Range,
     rule: str,
     state: int,
     wanted: Mapping[int, float],
-) -> Steady:
-    """Step 1, and whether what is wanted can be had at all."""
-    found = procedure.smallest(over, rule, state)
-    if found is None:
+) -> None:
+    """Step 1: where there is nothing steady, or where what is wanted can't be had at all."""
+    tried = len(lattice(*over, TRIED))
+    if procedure.smallest(over, rule, state) is None:
         raise Unsuited(
             f"without any remainder the ellipsoid has no steady state by the rule {rule} "
-            "anywhere in the range (a part of the state that doesn't decay is not measured); "
-            "choose another rule or measurement",
+            f"at any of {tried} places of the range (a part of the state that doesn't decay is not "
+            "measured); choose another rule or measurement",
             "dynamics",
         )
     for j, bound in wanted.items():
@@ -303,13 +304,13 @@ def _smallest(
         if bound < least:
             raise Unsuited(
                 f"{procedure.system.state_names[j]} is wanted within {bound:g}, and the "
-                f"noise alone leaves {least:.4g} in steady state, however many points there are; "
-                f"want at least that, or another rule than {rule}",
+                f"noise alone leaves {least:.4g} in steady state, however many points there are "
+                f"(at the best of {tried} places of the range and of as many about it); want at "
+                f"least that, or another rule than {rule}",
                 "analyses",
                 "operating_points",
                 "wanted",
             )
-    return found
 
 
 def _placements(over: Range, settings: Settings) -> dict[str, Array]:
@@ -346,7 +347,7 @@ def _placements(over: Range, settings: Settings) -> dict[str, Array]:
 ANALYSIS = Analysis(
     name="operating-points",
     summary="how many linear models a wanted bound needs, and where to linearise",
-    source="Otanez, Campbell 2004, sections III-B and IV",
+    source=f"{PAPER}, sections III-B and IV",
     settings=Settings,
     analyse=_analyse,
     example="switched_esmf",
