@@ -42,10 +42,10 @@ def _ends(design: Design) -> Chart:
         values = np.sort(one.worst_errors) / scale
         share = np.arange(1, len(values) + 1, dtype=float)
         lines.append(Line(one.solver, share, values, steps="pre"))
-    all_of_them = np.array([1.0, float(design.settings.starts)])
+    all_of_them = np.array([1.0, float(design.starts)])
     level = np.full(2, 1.1 * optimum / scale)
     lines.append(Line(f"110 % of the {design.best}", all_of_them, level, reference=True))
-    caption = f"Objective where {design.settings.starts:,} local starts end, in ascending order"
+    caption = f"Objective where {design.starts:,} local starts end, in ascending order"
     panel = Panel("normalised\nworst error", lines, log_y=True)
     return Chart("local_starts", caption, "start", [panel])
 

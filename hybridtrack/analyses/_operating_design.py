@@ -18,7 +18,8 @@ class Settings(NamedTuple):
     weights: of components of the dynamics (by state) or of the measurement ("measured NAME"), to
     compare errors of unlike units. placements: points by a name, to be compared: a number each, or
     a list where several states vary. least_points: how many are tried although fewer would do.
-    starts: of the local solvers (0: none), with starts_points points.
+    starts: of the local solvers (0: none; by default 1,000 in one state, 100 in several, where each
+    takes longer), with starts_points points.
     """
 
     range: dict[str, list[float]] | None = None
@@ -35,8 +36,11 @@ class Settings(NamedTuple):
     placements: dict[str, list[float | list[float]]] | None = None
     least_points: int = 3
     most_points: int = 6
-    starts: int = 1000
+    starts: int | None = None
     starts_points: int = 3
+
+
+STARTS, STARTS_OF_SEVERAL = 1000, 100
 
 
 class Design(NamedTuple):
@@ -63,6 +67,11 @@ class Design(NamedTuple):
         """What the best placements may be called: the optimum only with a certificate."""
         certain = all(step.placement.certificate for step in self.steps)
         return "optimum" if certain else "best found"
+
+    @property
+    def starts(self) -> int:
+        """Of each local solver."""
+        return len(self.study[0].worst_errors)
 
     @property
     def studied(self) -> float:

@@ -63,7 +63,7 @@ def _short(value: float | None) -> str:
 
 def _percent(part: float) -> str:
     """A small part, rounded up to a power of ten."""
-    return f"{10.0 ** math.ceil(math.log10(max(100.0 * part, 1e-7))):g} %"
+    return f"{10.0 ** math.ceil(math.log10(max(100.0 * part, 1e-4))):g} %"
 
 
 def _count(points: int) -> str:
@@ -92,6 +92,11 @@ def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
         )
         if not listed:
             return [f"With up to {_count(most)} the bound on {name} has no steady state; {leave}."]
+        told = {_bound(bound) for bound in bounds.values() if bound is not None}
+        if len(told) == 1 and None not in bounds.values() and most > 1:
+            return [
+                f"The bound on {name} settles at {told.pop()} with 1 to {most} points; {leave}."
+            ]
         settled = [count for count, bound in bounds.items() if bound is not None]
         plural = "s" * (settled[-1] != 1)
         return [f"The bound on {name} settles at {listed} point{plural}; {leave}."]
@@ -176,7 +181,7 @@ def _local(design: Design) -> list[str]:
         f"{share(one.share_within(TEN, optimum))} by {one.solver}" for one in design.study
     )
     return [
-        f"Of {design.settings.starts:,} random starts, "
+        f"Of {design.starts:,} random starts, "
         f"with {_count(design.settings.starts_points)}, "
         f"within 10 % of the {design.best} end, to the nearest fifth, {shares}: the solver decides."
     ]

@@ -47,7 +47,7 @@ def search(
     """The best `count` points in a box low (d,), high (d,) that restarts find.
 
     others (each (count, d) or (count - 1, d)): points to start from besides; the placement is no
-    worse than those of as many.
+    worse than theirs.
     """
     rng = np.random.default_rng([seed, count])
     d = len(low)
@@ -58,17 +58,14 @@ def search(
         coarse = [descend(function, kind, places, low, high, start) for start in starts]
         coarse.sort(key=lambda one: one[0])
         better = [_improved(function, kind, low, high, one) for _, one in coarse[:IMPROVED]]
+        better += [_improved(function, kind, low, high, one) for one in given]
         level, points = min(better, key=lambda one: one[0])
         ended = [(level, points), _improved(function, kind, low, high, points, thorough=True)]
-        ended += [
-            (worst_error(function, kind, low, high, one)[0], one)
-            for one in others
-            if len(one) == count
-        ]
+        ended += [(worst_error(function, kind, low, high, one)[0], one) for one in given]
         level, points = min(ended, key=lambda one: one[0])
         least = least_error(function, kind, low, high, count, level)
     agree = sum(one <= (1.0 + AGREE) * coarse[0][0] for one, _ in coarse)
-    doubt = f"the best of {len(starts)} starts, {agree} of which agree within {100 * AGREE:.0f} %"
+    doubt = f"the best of {len(starts)} starts, {agree} within {100 * AGREE:.0f} % of it at first"
     return Placement(points[np.lexsort(points.T[::-1])], level, least, "", doubt)
 
 

@@ -101,7 +101,7 @@ class Procedure:
         """Steps 2 and 3: the best `count` points.
 
         Where that is a search, it starts from others too, (n, d) of as many or of one fewer, and is
-        no worse than those of as many.
+        no worse than those.
         """
         if len(over.low) == 1:
             low, high = float(over.low[0]), float(over.high[0])

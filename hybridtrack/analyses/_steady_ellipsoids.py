@@ -213,7 +213,11 @@ def with_constants(A: Array, C: Array, Q: Array, R: Array, beta: float, rho: flo
     """
     grown = A / math.sqrt((1.0 - beta) * (1.0 - rho))
     wide = _riccati(grown, C.T @ np.linalg.solve(R / rho, C), Q / (beta * (1.0 - rho)))
-    return None if wide is None else intersection((1.0 - rho) * wide, C, R, rho)
+    if wide is None:
+        return None
+    shape = intersection((1.0 - rho) * wide, C, R, rho)
+    # doubling that has lost its digits may end in what is no ellipsoid
+    return shape if (np.diagonal(shape) >= 0.0).all() else None
 
 
 def _riccati(A: Array, information: Array, Q: Array) -> Array | None:

@@ -20,6 +20,8 @@ from hybridtrack.analyses._operating_charts import charts
 from hybridtrack.analyses._operating_design import (
     PAPER,
     RESERVED,
+    STARTS,
+    STARTS_OF_SEVERAL,
     TEN,
     WITHOUT,
     Design,
@@ -88,6 +90,9 @@ def findings(system: System, settings: Settings, seed: int, of_paper: bool = Fal
     weights = _weights(system, settings)
     procedure = Procedure(system, settings.remainder, weights, seed)
     over = _range(procedure, settings)
+    if settings.starts is None:
+        several = len(over.low) > 1
+        settings = settings._replace(starts=STARTS_OF_SEVERAL if several else STARTS)
     wanted = _wanted(system, settings)
     state = next(iter(wanted), system.state_names.index(procedure.function.states[0]))
     _refuse_unattainable(procedure, over, settings.rule, state, wanted)
