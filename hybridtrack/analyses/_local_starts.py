@@ -10,6 +10,7 @@ import numpy as np
 
 from hybridtrack.analyses._linearisation import Nonlinear
 from hybridtrack.analyses._objective import SOLVERS, Scaled
+from hybridtrack.analyses._worst_errors import peaks
 from hybridtrack.models import Array
 
 WITHIN_PERCENT = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -39,7 +40,10 @@ def local_starts(
     found = []
     for name in SOLVERS:
         ends = np.array([one[name] for one in ended])
-        worst = np.array([objective.worst(end) for end in ends])
         points = np.clip(low + (high - low) * ends.reshape(begun.shape), low, high)
+        if objective.ordered:
+            worst = np.array([objective.worst(end) for end in ends])
+        else:  # between a solver's places, few in each state, there are worse ones
+            worst = np.array([peaks(function, kind, low, high, one)[0].max() for one in points])
         found.append(LocalStarts(name, points, worst))
     return found

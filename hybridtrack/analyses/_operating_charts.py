@@ -30,7 +30,9 @@ def _error(design: Design, state: int) -> Chart:
     name = f"linearisation_error_{states[state]}" if several else "linearisation_error"
     others = ", worst over the other states" * several
     caption = f"Linearisation error over the range of {states[state]}{others}"
-    return Chart(name, caption, states[state], [Panel("error of the\nbest model", lines)])
+    unit = " (rad)" if states[state] in design.procedure.system.angles else ""
+    label = f"{states[state]}{unit}"
+    return Chart(name, caption, label, [Panel("error of the\nbest model", lines)])
 
 
 def _ends(design: Design) -> Chart:

@@ -62,7 +62,8 @@ def search(
         level, points = min(better, key=lambda one: one[0])
         ended = [(level, points), _improved(function, kind, low, high, points, thorough=True)]
         ended += [(worst_error(function, kind, low, high, one)[0], one) for one in given]
-        level, points = min(ended, key=lambda one: one[0])
+        _, points = min(ended, key=lambda one: one[0])
+        level, _ = worst_error(function, kind, low, high, points)
         least = least_error(function, kind, low, high, count, level)
     agree = sum(one <= (1.0 + AGREE) * coarse[0][0] for one, _ in coarse)
     doubt = f"the best of {len(starts)} starts, {agree} within {100 * AGREE:.0f} % of it at first"

@@ -45,6 +45,7 @@ class System(NamedTuple):
     measurement: tuple[Any, ...]  # (n_y,)
     process_noise: Array  # Q (n_x, n_x)
     measurement_noise: Array  # R (n_y, n_y)
+    angles: tuple[str, ...] = ()  # the states in radians
 
     @property
     def component_names(self) -> tuple[str, ...]:

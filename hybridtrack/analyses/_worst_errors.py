@@ -4,13 +4,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridtrack.analyses._linearisation import Nonlinear, lattice, of_bank
+from hybridtrack.analyses._linearisation import Nonlinear, lattice, of_bank, on_places
 from hybridtrack.models import Array
 
 CHECKED = {1: 20_001, 2: 40_000, 3: 46_656}  # places of a range of so many states
 PEAKS = 30  # that are looked into between the places of the lattice
+CLIMBED = 6  # of them, in several states
 SIDE = {1: 9, 2: 7, 3: 5}  # places along each axis about a peak
 FINEST = 1e-9  # of the range: places nearer to each other are one
+NUDGE = 1e-7  # of the range: a difference that slopes are taken over
+SETTLED = 1e-7  # relative: what more steps are not worth
 
 
 class Placement(NamedTuple):
@@ -33,8 +36,52 @@ def worst_error(
 ) -> tuple[float, Array]:
     """The largest error of the models at points (n, d) over a box, and its place (d,)."""
     errors, places = peaks(function, kind, low, high, points)
-    best = int(errors.argmax())
-    return float(errors[best]), places[best]
+    order = np.argsort(-errors, kind="stable")
+    found = [(float(errors[i]), places[i]) for i in order[:1]]
+    if len(low) > 1:
+        found += [_climbed(function, kind, low, high, points, places[i]) for i in order[:CLIMBED]]
+    return max(found, key=lambda one: one[0])
+
+
+def _climbed(
+    function: Nonlinear, kind: str, low: Array, high: Array, points: Array, place: Array
+) -> tuple[float, Array]:
+    """Uphill from a place, along the edge where models are equally wrong.
+
+    A lattice climbs such an edge badly. Linear programmes in a trust region: the smallest of the
+    models' errors is made the largest, each taken as linear in the place.
+    """
+    from scipy.optimize import linprog
+
+    width, d = high - low, len(low)
+    level = float(of_bank(function, kind, place[np.newaxis], points)[0])
+    trust = 2.0 / CHECKED[d] ** (1.0 / d)
+    while trust > FINEST and np.isfinite(level) and level > 0.0:
+        nudged = np.vstack([place, place + np.diag(NUDGE * width)])
+        found = on_places(function, kind, nudged)(points)  # (1 + d, n, k)
+        worst = found[0].argmax(axis=-1)
+        found = found[:, np.arange(len(points)), worst]
+        slopes = (found[1:] - found[0]).T / NUDGE  # (n, d)
+        part = (place - low) / width
+        answer = linprog(
+            np.append(np.zeros(d), -1.0),
+            A_ub=np.hstack([-slopes, np.full((len(points), 1), level)]),
+            b_ub=found[0],
+            bounds=[
+                *zip(np.maximum(-trust, -part), np.minimum(trust, 1.0 - part), strict=True),
+                (None, None),
+            ],
+            method="highs",
+        )
+        if answer.x is None or answer.x[-1] <= 1.0 + SETTLED:
+            break
+        tried = np.clip(place + answer.x[:d] * width, low, high)
+        reached = float(of_bank(function, kind, tried[np.newaxis], points)[0])
+        if reached > level:
+            place, level = tried, reached
+        else:
+            trust *= 0.3
+    return level, place
 
 
 def peaks(
