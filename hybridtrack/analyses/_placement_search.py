@@ -66,7 +66,10 @@ def search(
         level, _ = worst_error(function, kind, low, high, points)
         least = least_error(function, kind, low, high, count, level)
     agree = sum(one <= (1.0 + AGREE) * coarse[0][0] for one, _ in coarse)
-    doubt = f"the best of {len(starts)} starts, {agree} within {100 * AGREE:.0f} % of it at first"
+    doubt = (
+        f"the best of {len(starts)} starts, {agree} of which came within {100 * AGREE:.0f} % of it "
+        "on a coarse lattice"
+    )
     return Placement(points[np.lexsort(points.T[::-1])], level, least, "", doubt)
 
 

@@ -107,12 +107,15 @@ def findings(system: System, settings: Settings, seed: int, of_paper: bool = Fal
         )
     placements = _placements(over, settings)
     others = [*placements.values(), *(one.points[one.worst_errors.argmin()] for one in study)]
-    steps = list(procedure.steps(over, settings.rule, wanted, least, most, others))
+    steps = []
+    for step in procedure.steps(over, settings.rule, wanted, least, most, others):
+        _refuse_pole(procedure, over, step)
+        steps.append(step)
     given = [
         procedure.step(over, label, procedure.given(over, points), settings.rule, state)
         for label, points in placements.items()
     ]
-    for step in (*steps, *given):
+    for step in given:
         _refuse_pole(procedure, over, step)
     met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
     needed = met.index(True) + 1 if True in met else None
