@@ -2,8 +2,8 @@
 
 import functools
 import threading
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from collections.abc import Callable, Mapping
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,10 @@ from hybridtrack.bounded import BoundedTruth, Opponent
 from hybridtrack.config import Experiment, Window
 from hybridtrack.containment import Names as SetNames
 from hybridtrack.containment import NoiseTally, SetTally
-from hybridtrack.delays import Delays, DelayTally, merge_delays
+from hybridtrack.delays import Delays, DelayTally
 from hybridtrack.errors import Stopped
 from hybridtrack.estimators import NO_KNOWN_MODES, AtWork, Estimates, SetsAtWork
+from hybridtrack.groups import RAW, TRUTH, BlockResult, BlockTask, Cell, Series
 from hybridtrack.models import Array, Itself, JumpMarkovModel, ModeBank
 from hybridtrack.roots import square_root
 from hybridtrack.scoring import Given, Names, all_below, as_measured, blank_sheet
@@ -29,112 +30,18 @@ from hybridtrack.simulation import (
     step_lengths,
     two_point_start,
 )
-from hybridtrack.statistics import (
-    Moments,
-    SumMoments,
-    VectorMoments,
-    merge_moments,
-    merge_sum_moments,
-    merge_vectors,
-    sum_moments,
-    vector_moments,
-)
+from hybridtrack.statistics import Moments
 from hybridtrack.tallies import Tally
+from hybridtrack.tracks import TrackKeeper
 from hybridtrack.vectors import WIDTH
 
 SPAN_STEPS = 75  # at most, between two looks at Python, whose lock threads wait for
 DIVERGED = 1e60  # an estimate beyond this has no use, and its fourth power must stay finite
 
-RAW = "raw"
-TRUTH = "truth"
-
-Series = tuple[str, str]  # estimator, quantity
-Cell = tuple[str, str, str]  # estimator, window, quantity
-
-Key = TypeVar("Key", Series, Cell)
-M = TypeVar("M", Moments, SumMoments)
-
-
-class BlockTask(NamedTuple):
-    """A block of runs of one case."""
-
-    case: int
-    block: int
-    runs: int  # how many of the block's runs are wanted
-    tracks: int  # how many of them are kept whole
-
-
-class Track(NamedTuple):
-    """One quantity of one run over the steps."""
-
-    run: int
-    estimator: str
-    quantity: str
-    values: Array  # (n_steps,)
-
-
-class BlockResult(NamedTuple):
-    """Statistics of a block."""
-
-    task: BlockTask
-    steps: dict[Series, Moments]  # arrays (n_steps,)
-    sums: dict[Cell, tuple[Array, Array]]  # (runs,) sums over steps, and their numbers
-    final_bins: dict[str, Array]  # by estimator (3 * BINS, runs), see tallies.Totals
-    delays: dict[str, Delays]  # by estimator
-    status: dict[str, NDArray[np.int64]]  # by estimator (runs,): 0, or the step of divergence
-    tracks: list[Track]
-
-
-class GroupStatistics(NamedTuple):
-    """Statistics of several blocks of one case, merged in their order."""
-
-    steps: dict[Series, Moments]
-    windows: dict[Cell, SumMoments]
-    final_bins: dict[str, VectorMoments]
-    delays: dict[str, Delays]
-    diverged: dict[str, int]
-
 
 def run_block(experiment: Experiment, task: BlockTask, stop: threading.Event) -> BlockResult:
     """Simulate, estimate and score one block. Raises Stopped soon after `stop` is set."""
     return _Block(experiment, task).run(stop)
-
-
-def merge(a: GroupStatistics, b: GroupStatistics) -> GroupStatistics:
-    """Two groups together; `a` comes first in the order of blocks."""
-    return GroupStatistics(
-        _merged(a.steps, b.steps, merge_moments),
-        _merged(a.windows, b.windows, merge_sum_moments),
-        {label: merge_vectors(a.final_bins[label], b.final_bins[label]) for label in a.final_bins},
-        {label: merge_delays(a.delays[label], b.delays[label]) for label in a.delays},
-        {key: a.diverged[key] + b.diverged[key] for key in a.diverged},
-    )
-
-
-def _merged(a: dict[Key, M], b: dict[Key, M], merge_all: Callable[[M, M], M]) -> dict[Key, M]:
-    """Moments of the same keys merged all at once: a call of NumPy costs more than its work."""
-    if not a:
-        return {}
-    kind = type(next(iter(a.values())))
-    together = (zip(*(group[key] for key in a), strict=True) for group in (a, b))
-    merged = merge_all(*(kind(*map(np.array, fields)) for fields in together))
-    return dict(zip(a, map(kind, *merged), strict=True))
-
-
-def summarise(result: BlockResult) -> GroupStatistics:
-    """A block as a group of its own."""
-    windows: dict[Cell, SumMoments] = {}
-    if result.sums:
-        sums, numbers = (np.array([pair[i] for pair in result.sums.values()]) for i in (0, 1))
-        sound = {label: status == 0 for label, status in result.status.items()}
-        moments = sum_moments(sums, numbers, np.array([sound[cell[0]] for cell in result.sums]))
-        windows = dict(zip(result.sums, map(SumMoments, *moments), strict=True))
-    final_bins = {
-        label: vector_moments(sums, result.status[label] == 0)
-        for label, sums in result.final_bins.items()
-    }
-    diverged = {label: int((status > 0).sum()) for label, status in result.status.items()}
-    return GroupStatistics(result.steps, windows, final_bins, result.delays, diverged)
 
 
 def inside(window: Window, times_s: Array, first_scan: int, truth: TruthSpan) -> NDArray[np.bool_]:
@@ -167,6 +74,12 @@ def _prepared_for_one(
 ) -> Any:
     """An estimator for such a step, which blocks have in common too."""
     return estimator.one.prepare(settings, _model_of_one(bank, step_s, covariance, even))
+
+
+def _in_metres(names: tuple[str, ...], units: Mapping[str, str]) -> tuple[str, ...]:
+    """Names of positions and velocities as scores know them; '' for what has another unit."""
+    scored = {"": "m", "v": "m/s"}
+    return tuple(n if units.get(n) == scored.get(n[:-1]) else "" for n in names)
 
 
 def _one_step(running: SetsAtWork, prepared: Any) -> Callable[[Array], tuple[Array, Array]]:
@@ -219,7 +132,7 @@ class _Block:
             self._final_share = Moments(*(np.zeros(self._n_steps) for _ in range(3)))
         labels = (RAW, *(chosen.label for chosen in experiment.estimators))
         self._status = {label: np.zeros(task.runs, dtype=np.int64) for label in labels}
-        self._tracks: dict[tuple[int, str, str], Array] = {}
+        self._tracks = TrackKeeper(experiment, task, self._n_steps)
         self._held: NDArray[np.bool_] | None = None
         fixed, everything = self._simulation.fixed, slice(0, self._n_steps)
         if fixed is not None:
@@ -237,7 +150,7 @@ class _Block:
                 self._start(scans, stop)
             if self._held is None:
                 self._note_shares(span, scans.truth)
-            self._keep_truth(span, scans)
+            self._tracks.truth(span, self._simulation.state_names, scans)
             used = max(self._first_step - span.start, 0)  # scans of a two-point start
             if used:
                 span, scans = slice(span.start + used, span.stop), scans.cut(slice(used, None))
@@ -273,13 +186,8 @@ class _Block:
                 if self._simulation.fixed is not None:
                     shares = watched.shares().items()
                     steps |= {(label, f"mode_estimate:{mode}"): m for mode, m in shares}
-        kept = sorted(self._tracks.items(), key=lambda item: self._place(item[0][1]))
-        tracks = [Track(*key, values) for key, values in kept]
+        tracks = self._tracks.tracks()
         return BlockResult(self._task, steps, sums, final_bins, delays, self._status, tracks)
-
-    def _place(self, label: str) -> int:
-        """A label's place in the scenario's order; truth and measurements come first."""
-        return [*self._status].index(label) if label in self._status else -1
 
     # ---- the filters' start ----
 
@@ -336,6 +244,8 @@ class _Block:
         experiment, initial = self._experiment, self._experiment.initial
         model = experiment.nonlinear
         assert model is not None
+        if self._task.tracks:
+            self._tracks.noise_free(model.course(truth.start, self._n_steps)[1:])
         mean = np.repeat(initial.mean[:, np.newaxis], self._lanes, axis=1)
         if initial.follows_truth:
             mean = self._simulation.initial_state.copy()
@@ -373,7 +283,11 @@ class _Block:
     def _advance(self, span: slice, scans: Scans) -> None:
         """Filter and score scans that none of the filters started from."""
         held = self._windows(span, scans.truth) if self._held is None else self._held[span]
-        self._score(span, RAW, scans, held, as_measured(scans.measurements))
+        measured = as_measured(scans.measurements)
+        lost = self._lost(scans.truth)
+        if lost is not None:
+            self._give_up(span, RAW, measured, lost)
+        self._score(span, RAW, scans, held, measured)
         if self._noise is not None:
             self._noise.add(self._simulation.noise_outside, held)
         prepared = self._prepared(span)
@@ -383,13 +297,13 @@ class _Block:
             estimates = running.advance(
                 prepared[label], scans.measurements, covariance=covariance, known_modes=told
             )
-            self._note_status(span, label, estimates)
+            self._note_status(span, label, estimates, lost)
             self._score(span, label, scans, held, estimates)
             if self._experiment.nonlinear is not None:
                 self._score_sets(span, label, cast(SetsAtWork, running), scans, held, estimates)
             if label in self._watched:
                 self._watched[label].add(span.start, scans.truth.mode, estimates.mode_probabilities)
-            self._keep_estimates(span, label, running, estimates)
+            self._tracks.estimates(span, label, running, estimates)
 
     def _true_modes(self, running: AtWork, scans: Scans) -> Array:
         """The truth's modes as the estimator counts them (n_steps, lanes)."""
@@ -430,10 +344,12 @@ class _Block:
     def _begin_tally(self, label: str, estimates: Estimates) -> Tally:
         experiment, running = self._experiment, self._running.get(label)
         measured = tuple("xyz"[: estimates.mean.shape[1]])
+        states = self._simulation.state_names
         if experiment.nonlinear is not None:
-            measured = experiment.nonlinear.measurement_names
+            measured = _in_metres(experiment.nonlinear.measurement_names, experiment.units)
+            states = _in_metres(states, experiment.units)
         names = Names(
-            self._simulation.state_names,
+            states,
             experiment.truth_modes,
             running.state_names if running else measured,
             running.mode_names if running else (),
@@ -469,67 +385,31 @@ class _Block:
         moments.mean[span] = share
         moments.squares[span] = runs * share * (1.0 - share)
 
-    def _note_status(self, span: slice, label: str, estimates: Estimates) -> None:
-        """Note the step at which a run diverges; from there on its estimates are NaN."""
-        if all_below(estimates.mean, DIVERGED):
+    def _lost(self, truth: TruthSpan) -> NDArray[np.bool_] | None:
+        """Where (n_steps, lanes) a nonlinear truth has no value any more; None if nowhere."""
+        if self._noise is None or all_below(truth.state, DIVERGED):
+            return None
+        beyond: NDArray[np.bool_] = ~(np.abs(truth.state).max(axis=1) < DIVERGED)
+        return beyond
+
+    def _note_status(
+        self, span: slice, label: str, estimates: Estimates, lost: NDArray[np.bool_] | None
+    ) -> None:
+        """Note the step at which a run diverges, or its truth is lost."""
+        if lost is None and all_below(estimates.mean, DIVERGED):
             return
+        beyond = ~(np.abs(estimates.mean).max(axis=1) < DIVERGED)
+        self._give_up(span, label, estimates, beyond if lost is None else beyond | lost)
+
+    def _give_up(
+        self, span: slice, label: str, estimates: Estimates, beyond: NDArray[np.bool_]
+    ) -> None:
+        """From its first step beyond on (n_steps, lanes) a run's estimates are NaN."""
         status = self._status[label]
-        sound = np.abs(estimates.mean).max(axis=1) < DIVERGED
-        for b in np.flatnonzero(~sound.all(axis=0)):
-            first = int(np.argmin(sound[:, b]))
+        for b in np.flatnonzero(beyond.any(axis=0)):
+            first = int(np.argmax(beyond[:, b]))
             if b < self._task.runs and status[b] == 0:
                 status[b] = span.start + first + 1
             for array in estimates:
                 if array.shape[-1] == self._lanes:
                     array[first:, ..., b] = np.nan
-
-    # ---- tracks of the first runs ----
-
-    def _keep_truth(self, span: slice, scans: Scans) -> None:
-        if not self._task.tracks:
-            return
-        for e, name in enumerate(self._simulation.state_names):
-            self._keep(span, TRUTH, name, scans.truth.state[:, e])
-        if self._experiment.truth_modes:
-            self._keep(span, TRUTH, "mode", scans.truth.mode.astype(np.float64))
-        model = self._experiment.nonlinear
-        for m in range(scans.measurements.shape[1]):
-            name = "xy"[m] if model is None else model.measurement_names[m]
-            self._keep(span, "measurement", name, scans.measurements[:, m])
-
-    def _keep_estimates(
-        self, span: slice, label: str, running: AtWork, estimates: Estimates
-    ) -> None:
-        if not self._task.tracks:
-            return
-        if self._experiment.nonlinear is not None:
-            self._keep_sets(span, label, cast(SetsAtWork, running), estimates)
-            return
-        for e, name in enumerate(running.state_names):
-            self._keep(span, label, name, estimates.mean[:, e])
-            variance = estimates.covariance[:, e * (e + 1) // 2 + e]
-            self._keep(span, label, f"std:{name}", np.sqrt(np.maximum(variance, 0.0)))
-        if len(running.mode_names) > 1:
-            for j, name in enumerate(running.mode_names):
-                values = estimates.mode_probabilities[:, j]
-                self._keep(span, label, f"mode_probability:{name}", values)
-        if len(estimates.final_mode_probability):
-            values = estimates.final_mode_probability
-            self._keep(span, label, "final_mode_probability", values)
-
-    def _keep_sets(
-        self, span: slice, label: str, running: SetsAtWork, estimates: Estimates
-    ) -> None:
-        for e, name in enumerate(running.state_names):
-            self._keep(span, label, name, estimates.mean[:, e])
-            bound: Array = np.sqrt(running.sets.shape[:, e, e])
-            self._keep(span, label, f"bound:{name}", bound)
-        if running.point_names:
-            self._keep(span, label, "model", running.sets.chosen.astype(np.float64) + 1.0)
-
-    def _keep(self, span: slice, label: str, quantity: str, values: Array) -> None:
-        for run in range(self._task.tracks):
-            key = (run, label, quantity)
-            if key not in self._tracks:
-                self._tracks[key] = np.full(self._n_steps, np.nan)
-            self._tracks[key][span] = values[:, run if values.shape[1] > 1 else 0]

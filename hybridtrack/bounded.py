@@ -47,6 +47,7 @@ class BoundedTruth(NamedTuple):
     process: Noise
     measurement: Noise
     against: str | None = None  # the filter that the adversary plays
+    detection_probability: float = 1.0  # of a whole scan; NaN where it is missed
 
 
 class NoiseRuns:
@@ -139,7 +140,8 @@ class BoundedRuns:
         lanes: int,
     ) -> None:
         """stream: by purpose; drawn: runs drawn, of which the first `lanes` are kept."""
-        self._truth, self._lanes = truth, lanes
+        self._truth, self._drawn, self._lanes = truth, drawn, lanes
+        self._detection = stream(Purpose.DETECTION)
         self._process = NoiseRuns(truth.process, stream(Purpose.PROCESS_NOISE), drawn)
         self._measurement = NoiseRuns(truth.measurement, stream(Purpose.MEASUREMENT_NOISE), drawn)
         spread = Noise(truth.spread, truth.model.initial_shape, 1)
@@ -154,9 +156,17 @@ class BoundedRuns:
         The last is (steps, lanes, 2): 1 where the process noise, and where the measurement noise,
         is outside the ellipsoid that filters believe in, else 0.
         """
+        with np.errstate(all="ignore"):  # a truth that runs away is told by who scores it
+            return self._advance(steps)
+
+    def _advance(self, steps: int) -> tuple[Array, Array, Array]:
         model, lanes = self._truth.model, self._lanes
         w = self._process.advance(steps)[:, :lanes]
         v = self._measurement.advance(steps)[:, :lanes]
+        missed = np.zeros((steps, lanes), dtype=np.bool_)
+        if self._truth.detection_probability < 1.0:
+            uniform = self._detection.random((steps, self._drawn))[:, :lanes]
+            missed = uniform >= self._truth.detection_probability
         states = np.empty((steps, lanes, len(model.state_names)))
         measurements = np.empty((steps, lanes, len(model.measurement_names)))
         for k in range(steps):
@@ -168,7 +178,7 @@ class BoundedRuns:
             clean = model.measurement.value(self.state, u)
             if self._truth.against is not None:
                 v[k] = self._hide(clean, v[k], u)
-            measurements[k] = clean + v[k]
+            measurements[k] = np.where(missed[k, :, np.newaxis], np.nan, clean + v[k])
             if self.opponent is not None:
                 centre, shape = self.opponent.advance(measurements[k])
                 self.opponent = self.opponent._replace(centre=centre, shape=shape)

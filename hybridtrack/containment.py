@@ -44,14 +44,21 @@ NOISE = {
         "measurement_noise_outside", False, "less", "the same of the measurement noise"
     ),
 }
-MEAN_BOUND, FIRST_CHOICE = "mean_bound", "first_choice_s"  # these are of a state, of a model
-FAMILIES = (MEAN_BOUND, FIRST_CHOICE)
+MEAN_BOUND, RMSE, MSE = "mean_bound", "rmse", "mse"  # these are of a state
+SQUARED_ERROR = "squared_error"
+FIRST_CHOICE = "first_choice_s"  # this one of a model
+FAMILIES = (MEAN_BOUND, RMSE, MSE, FIRST_CHOICE)
 
 
 def set_metrics(states: tuple[str, ...], points: tuple[str, ...]) -> dict[str, Metric]:
     """The metrics of an experiment with sets, by name; points: names of operating points."""
     of_states = {
         f"{MEAN_BOUND}:{name}": Metric(f"bound:{name}", False, "less", f"mean bound on {name}")
+        for name in states
+    }
+    of_states |= {
+        f"{kind}:{name}": Metric(f"{SQUARED_ERROR}:{name}", kind == RMSE, "less", f"{text} {name}")
+        for kind, text in ((RMSE, "root mean square error of"), (MSE, "mean square error of"))
         for name in states
     }
     of_points = {
@@ -97,7 +104,7 @@ class SetTally:
         }
         self._largest = np.zeros((n_w, runs))
         self._switches = np.zeros((n_w, runs))
-        self._bounds = np.zeros((n_w, n_x, runs))
+        self._bounds, self._squares = np.zeros((2, n_w, n_x, runs))
         self._numbers = np.zeros((n_w, runs))
         self._first_s = np.full((n_w, n_p, runs), np.inf)
         self._last: NDArray[np.int64] | None = None
@@ -133,7 +140,9 @@ class SetTally:
             )
             self._switches[w] += (switched & inside).sum(axis=0)
             self._numbers[w] += inside.sum(axis=0)
-            self._bounds[w] += np.where(inside[..., np.newaxis], bound, 0.0).sum(axis=0).T
+            here = inside[..., np.newaxis]
+            self._bounds[w] += np.where(here, bound, 0.0).sum(axis=0).T
+            self._squares[w] += np.where(here, error**2, 0.0).sum(axis=0).T
             for i in range(len(self._names.points)):
                 when = np.where(inside & (chosen == i), times_s[:, np.newaxis], np.inf)
                 self._first_s[w, i] = np.minimum(self._first_s[w, i], when.min(axis=0))
@@ -174,6 +183,8 @@ class SetTally:
             yield (window, "largest_error"), (self._largest[w], once)
             for e, state in enumerate(self._names.states):
                 yield (window, f"bound:{state}"), (self._bounds[w, e], self._numbers[w])
+                squares = (self._squares[w, e], self._numbers[w])
+                yield (window, f"{SQUARED_ERROR}:{state}"), squares
             if not points:
                 continue
             first_s = self._first_s[w]

@@ -1,6 +1,7 @@
 """What a scenario asks for, in SI and arrays: the frozen Experiment and its parts."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,6 +72,7 @@ class Experiment(NamedTuple):
     resolved: dict[str, Any]  # the scenario as it can be run again
     nonlinear: NonlinearModel | None = None  # instead of a bank of modes, which is empty then
     point_names: tuple[str, ...] = ()  # of operating points, of the estimator with the most
+    units: Mapping[str, str] = MappingProxyType({})  # of states and measurements beside `nonlinear`
 
     @property
     def metrics(self) -> Mapping[str, Metric]:
@@ -86,6 +88,12 @@ class Experiment(NamedTuple):
             return QUANTITIES
         own = set_metrics(self.nonlinear.state_names, self.point_names).values()
         return (*QUANTITIES, *dict.fromkeys(metric.quantity for metric in own))
+
+    @property
+    def states(self) -> dict[str, str]:
+        """Where it is nonlinear, the states with their units, '' where none is given."""
+        names = self.nonlinear.state_names if self.nonlinear else ()
+        return {name: self.units.get(name, "") for name in names}
 
     def switches(self, case: int) -> bool:
         """Whether the truth of a case may change its mode."""

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridtrack import columns
-from hybridtrack.blocks import GroupStatistics
 from hybridtrack.config import Experiment
 from hybridtrack.delays import Delays, distribution
+from hybridtrack.groups import GroupStatistics
 from hybridtrack.models import Array
 from hybridtrack.simulation import Case, sojourns
 from hybridtrack.statistics import Estimate, ratio_of_sums

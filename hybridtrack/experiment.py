@@ -15,19 +15,13 @@ import numpy as np
 
 from hybridtrack import __version__, outcomes, results
 from hybridtrack.analyses import lint
-from hybridtrack.blocks import (
-    BlockTask,
-    GroupStatistics,
-    Track,
-    merge,
-    run_block,
-    summarise,
-)
+from hybridtrack.blocks import run_block
 from hybridtrack.compiled import PACKAGE, host_processor, source_digest
 from hybridtrack.config import Experiment, dump
 from hybridtrack.delays import Delays
 from hybridtrack.detections import delay_rows
 from hybridtrack.executors import in_order
+from hybridtrack.groups import BlockTask, GroupStatistics, Track, merge, summarise
 from hybridtrack.guarantees import SetRuns
 from hybridtrack.results import RunFolder
 from hybridtrack.simulation import BLOCK_RUNS
@@ -278,6 +272,7 @@ def _manifest(experiment: Experiment) -> dict[str, Any]:
         "windows": [window.name for window in experiment.windows],
         "compare_with": experiment.compare_with,
         "error": experiment.error,
+        "states": experiment.states,
         "cases": len(experiment.cases),
         "versions": {
             "hybridtrack": __version__,

@@ -24,7 +24,7 @@ from hybridtrack.page import (
     save_one,
     style,
 )
-from hybridtrack.set_courses import draw_bounds, draw_models, draw_points
+from hybridtrack.set_courses import draw_bounds, draw_models, draw_points, draw_sets
 from hybridtrack.trajectories import draw_trajectory
 
 __all__ = ["RunInformation", "draw", "save"]
@@ -45,7 +45,7 @@ def draw(
     Returns:
         Figures by name: trajectory (of the first run in `tracks`), position_error,
         velocity_error, error_ratio, mode_probability, mode_likelihood, final_mode_probability and
-        reliability; of sets bound, operating_points and model_chosen. With several cases the
+        reliability; of sets sets, bound, operating_points and model_chosen. With several cases the
         figures over time are drawn for each of the first six, and their names end in `-CASE`.
     """
     with style():
@@ -60,6 +60,7 @@ def draw(
                 figures[metric + case.suffix] = draw_modes(case, metric, looks, information)
             name = "final_mode_probability"
             figures[name + case.suffix] = draw_final_mode(case, looks, information)
+            figures["sets" + case.suffix] = draw_sets(case, tracks, looks, information)
             figures["bound" + case.suffix] = draw_bounds(case, looks, information)
             figures["operating_points" + case.suffix] = draw_points(case, looks, information)
             figures["model_chosen" + case.suffix] = draw_models(case, tracks, looks, information)
@@ -87,7 +88,8 @@ def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
 def _looks(steps: Table, tracks: Table, information: RunInformation) -> dict[str, Look]:
     """Colour and dashes by the scenario's order of estimators; the raw measurements come first."""
     names = dict.fromkeys([*information.estimators, *steps["estimator"], *tracks["estimator"]])
-    estimators = [name for name in names if name not in ("raw", "truth", "measurement")]
+    others = ("raw", "truth", "measurement", "noise_free")
+    estimators = [name for name in names if name not in others]
     n = len(COLOURS)
     return {"raw": Look("measurements", RAW_COLOUR, (0, (1, 1)))} | {
         name: Look(plain(name, 60), COLOURS[i % n], DASHES[(i + i // n) % n])

@@ -1,8 +1,8 @@
 """From the runs of sets to the rows of a run folder's table on them: outcomes kept apart, medians.
 
 A run may be *violated* (the truth left the set), *emptied* (a measurement left nothing of the set:
-noise or remainder beyond what the filter believes), *diverged* (its set grew past `growth` times
-its first width, or a value was lost, and it isn't followed further), or *useless* (the bound on an
+noise or remainder beyond what the filter believes), *diverged* (a bound grew past `growth` times
+the first one, or a value was lost, and it isn't followed further), or *useless* (the bound on an
 angle exceeds pi at some step). One run may be several of these.
 """
 

@@ -1,14 +1,14 @@
 """Nonlinear models with bounded noise: what set-membership filters believe, and its truth.
 
 x_k = f(x_{k-1}, u_k) + w_k, y_k = h(x_k, u_k) + v_k, with w in Omega(0, Q) and v in Omega(0, R)
-(Otanez 2004, eq. 8-12). Both maps come from expressions; see expressions.
+(Otanez 2004, eq. 8-12). Both maps come from expressions; see maps.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from hybridtrack.expressions import Map
+from hybridtrack.maps import Map
 from hybridtrack.models import Array
 from hybridtrack.remainders import Remainder
 

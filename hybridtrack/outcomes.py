@@ -9,11 +9,11 @@ import numpy as np
 import pyarrow as pa
 
 from hybridtrack import columns, results
-from hybridtrack.blocks import RAW, BlockResult, GroupStatistics, Track
 from hybridtrack.config import Experiment
 from hybridtrack.containment import metrics_of
 from hybridtrack.detections import false_switches
 from hybridtrack.errors import UserError
+from hybridtrack.groups import RAW, BlockResult, GroupStatistics, Track
 from hybridtrack.simulation import BLOCK_RUNS
 from hybridtrack.statistics import (
     CALIBRATION,

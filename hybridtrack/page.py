@@ -67,6 +67,12 @@ class RunInformation(NamedTuple):
     modes: tuple[str, ...]
     error: str = "rmse"  # or mse: what errors over time are
     compare_with: str | None = None  # the estimator that ratios are to
+    units: Mapping[str, str] | None = None  # by state ('' unknown), where states aren't our own
+
+    def label(self, state: str) -> str:
+        """A state with its unit, for an axis."""
+        unit = (self.units or {}).get(state)
+        return f"{state} ({unit})" if unit else state
 
 
 class Look(NamedTuple):

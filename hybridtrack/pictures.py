@@ -21,6 +21,7 @@ def draw_run(folder: Path) -> list[Path]:
         modes=tuple(manifest["modes"]),
         error=manifest["error"],
         compare_with=manifest["compare_with"],
+        units=manifest["states"] or None,
     )
     steps, tracks, reliability = (
         results.read_columns(folder, name) for name in ("steps", "tracks", "reliability")

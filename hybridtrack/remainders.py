@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridtrack.expressions import Map, Wave, waves
+from hybridtrack.maps import Map, Wave, waves
 from hybridtrack.models import Array
 
 ROUNDING = 16 * np.finfo(np.float64).eps  # of a sum of five terms, each right to two last bits
@@ -105,7 +105,6 @@ class Balls:
         import sympy
 
         arguments = (*map_.states, *map_.inputs)
-        words = ball_functions()
         # Derivatives of atan2 are smooth across its cut, where it jumps by 2 pi.
         cuts = [
             (i, angle)
@@ -115,10 +114,10 @@ class Balls:
         ]
         self._cut = [i for i, _ in cuts]
         sides = [side for _, angle in cuts for side in angle.args]
-        self._sides = sympy.lambdify(arguments, sides, modules=[words])
+        self._sides = over_balls(arguments, sides)
         self._shape = (len(map_.expressions), len(map_.states))
-        self._jacobian = sympy.lambdify(arguments, list(map_.gradient), modules=[words])
-        self._hessian = sympy.lambdify(arguments, list(map_.curvature), modules=[words])
+        self._jacobian = over_balls(arguments, map_.gradient)
+        self._hessian = over_balls(arguments, map_.curvature)
 
     def enclose(self, centre: Array, low: Array, high: Array, u: Array) -> Enclosed:
         """Ends (lanes, n) over the hull of the box [low, high] and the centre."""
@@ -146,11 +145,12 @@ class Balls:
             row = range(i * n_x, (i + 1) * n_x)
             mean_value, lagrange = arb(0), arb(0)
             for j, d in zip(row, step, strict=True):
-                mean_value += (slopes[j] - there[j]) * d
+                mean_value += product(slopes[j] - there[j], d)
             for e in range(n_x):
                 for f in range(n_x):
                     bend = bends[(i * n_x + e) * n_x + f]
-                    lagrange += bend * (square(step[e]) if e == f else step[e] * step[f])
+                    square = even_power(step[e], 2) if e == f else step[e] * step[f]
+                    lagrange += product(bend, square)
             forms = [ends(mean_value), ends(lagrange / 2)]
             lower[i] = max(form[0] for form in forms)
             upper[i] = min(form[1] for form in forms)
@@ -171,9 +171,38 @@ class Balls:
             return [arb("0 +/- inf")] * count
 
 
-def square(ball: Any) -> Any:
-    """The range of a square, which a product of the ball with itself would take below 0."""
-    return (ball.abs_lower() ** 2).union(ball.abs_upper() ** 2)
+def over_balls(arguments: Sequence[Any], expressions: Sequence[Any]) -> Callable[..., Any]:
+    """SymPy expressions as one function of balls."""
+    import sympy
+    from sympy.printing.lambdarepr import LambdaPrinter
+
+    class Printer(LambdaPrinter):  # type: ignore[misc]
+        def _print_Pow(self, expr: Any, **settings: Any) -> Any:
+            if expr.exp.is_Integer and expr.exp % 2 == 0:
+                return f"even_power({self._print(expr.base)}, {expr.exp})"
+            return super()._print_Pow(expr, **settings)
+
+    words = ball_functions()
+    printer = Printer({"allow_unknown_functions": True, "user_functions": {w: w for w in words}})
+    compiled: Callable[..., Any] = sympy.lambdify(
+        arguments, list(expressions), modules=[words], printer=printer
+    )
+    return compiled
+
+
+def product(one: Any, two: Any) -> Any:
+    """The range of a product: of balls by middle and radius [0, 2] times [0, 2] begins at -2."""
+    corners = [a * b for a in (one.lower(), one.upper()) for b in (two.lower(), two.upper())]
+    return corners[0].union(corners[1]).union(corners[2]).union(corners[3])
+
+
+def even_power(ball: Any, n: int) -> Any:
+    """The range of an even power, which a product of the ball with itself would take below 0."""
+    from flint import arb
+
+    low, high = (end ** abs(n) for end in (arb(ball).abs_lower(), arb(ball).abs_upper()))
+    found = low.union(high)
+    return found if n > 0 else 1 / found
 
 
 def ends(ball: Any) -> tuple[float, float]:
@@ -197,5 +226,6 @@ def ball_functions() -> dict[str, Any]:
 
     plain = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log")
     words: dict[str, Any] = {name: of(name) for name in (*plain, "sqrt")}
+    words["even_power"] = even_power
     words["atan2"] = lambda y, x: arb.atan2(arb(y), arb(x))
     return words

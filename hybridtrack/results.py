@@ -35,7 +35,7 @@ SHARD_NAME = re.compile(r"(?P<place>\d{4,}-\d{6,})-(?P<runs>\d+)")  # place: cas
 PART_NAME = re.compile(r"\..+\.\d+\.part(ial)?")
 FIGURE_NAME = re.compile(
     r"(trajectory|(position|velocity)_error|error_ratio|(final_)?mode_(probability|likelihood)"
-    r"|reliability|bound|operating_points|model_chosen)(-.+)?\.png"
+    r"|reliability|sets|bound|operating_points|model_chosen)(-.+)?\.png"
 )
 FINISHED: dict[str, type | tuple[type, ...]] = {  # what a finished run's manifest is asked for
     "name": str,
@@ -49,6 +49,7 @@ FINISHED: dict[str, type | tuple[type, ...]] = {  # what a finished run's manife
     "compare_with": (str, type(None)),
     "error": str,
     "diverged": dict,
+    "states": dict,
 }
 DAMAGE = (
     OSError,

@@ -15,6 +15,7 @@ from hybridtrack.tables_of_sets import set_tables
 from hybridtrack.typesetting import counted, estimate, hanging, plain_table, print_parts
 
 # Metric, heading: what the main table shows, where the scenario has it.
+RAW = "raw"
 ERRORS = {
     "rmse": (
         ("position_rmse_m", "position\nRMS, m"),
@@ -59,7 +60,9 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     runs, cases = manifest["runs"], manifest["cases"]
     over = f" in each of {cases} cases" if cases > 1 else ""
     yield Text(f"{manifest['title']}: {counted(runs, 'run')}{over}, seed {manifest['seed']}\n")
-    shown = (*ERRORS[manifest["error"]], *MODES)
+    error, units = manifest["error"], manifest["states"]
+    of_states = [(f"{error}:{s}", heading(s, u, error)) for s, u in units.items()]
+    shown = (*ERRORS[error], *of_states, *MODES)
     yield _summary("estimator", summary, ["raw", *manifest["estimators"]], shown)
     comparisons = results.read_rows(path, "comparisons")
     if comparisons:
@@ -73,9 +76,7 @@ def _parts(path: Path) -> Iterator[RenderableType]:
         yield _summary("mode is the last", summary, labels, FINAL_MODE)
     yield from delay_tables(results.read_rows(path, "delays"), summary)
     for label, count in manifest.get("diverged", {}).items():
-        yield Text(
-            f"{label}: {count:,} of {counted(runs * cases, 'run')} diverged and are left out"
-        )
+        yield Text(f"{label}: {_left_out(label, count, runs * cases)}")
     windows = [
         w for w in manifest["windows"] if w != "all" and w in {row["window"] for row in summary}
     ]
@@ -86,6 +87,23 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     if published:
         yield ""
         yield published_table(published)
+
+
+def heading(state: str, unit: str, error: str) -> str:
+    """Of a column of one state's errors."""
+    if unit and error == "mse":
+        unit = f"{unit}²" if unit.isalpha() else f"({unit})²"
+    kind = "MSE" if error == "mse" else "RMS"
+    return f"{state}\n{kind}, {unit}" if unit else f"{state}\n{kind}"
+
+
+def _left_out(label: str, count: int, runs: int) -> str:
+    if label != RAW:
+        return f"{count:,} of {counted(runs, 'run')} diverged and are left out"
+    return (
+        f"in {count:,} of {counted(runs, 'run')} the truth itself runs away; they are left out of "
+        "everything (at which step: 'status' in runs.parquet); shorten 'clock', or mend 'dynamics'"
+    )
 
 
 def _theory(sentences: list[str]) -> Iterator[RenderableType]:
@@ -124,11 +142,12 @@ def _by_metric(
 ) -> Table:
     """A row per estimator, a column per metric that there is."""
     metrics = [(m, h) for m, h in shown if any(key[1] == m for key in figures)]
+    labels = [label for label in labels if any((label, m) in figures for m, _ in metrics)]
     table = plain_table()
     table.add_column(Text(heading), overflow="fold")
     for _, text in metrics:
         text = text.partition(",")[0] if heading.startswith("ratio") else text
-        table.add_column(text, justify="right", no_wrap=True)
+        table.add_column(Text(text), justify="right", no_wrap=True)
     for label in labels:
         table.add_row(Text(label), *(figures.get((label, metric), "") for metric, _ in metrics))
     return table

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich.console import RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from hybridtrack.typesetting import estimate, plain_table
@@ -29,36 +30,56 @@ def set_tables(
     labels = [label for label in manifest["estimators"] if (label, OUTCOMES[0][0]) in found]
     if not labels:
         return
-    bounds = [f for f in dict.fromkeys(r["figure"] for r in sets) if f.startswith(MEDIAN_BOUND)]
     switches = {
         row["estimator"]: estimate(row["value"], row["standard_error"])
         for row in summary
         if (row["metric"], row["window"]) == ("model_switches", "all")
     }
+    outcomes = {
+        label: [
+            *(f"{found[label, figure]['value']:,.0f}" for figure, _ in OUTCOMES),
+            largest(found[label, "largest_normalised_error"]["value"]),
+            *([switches.get(label, "")] if switches else []),
+        ]
+        for label in labels
+    }
+    headings = [*(heading for _, heading in OUTCOMES), "largest\nerror"]
     yield ""
-    table = plain_table()
-    table.add_column("sets: runs that", overflow="fold")
-    headings = [heading for _, heading in OUTCOMES]
-    headings += ["largest\nerror", *(f"bound on\n{f.removeprefix(MEDIAN_BOUND)}" for f in bounds)]
-    for heading in [*headings, *(["switches"] if switches else [])]:
-        table.add_column(Text(heading), justify="right", no_wrap=True)
-    for label in labels:
-        cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in OUTCOMES]
-        cells.append(largest(found[label, "largest_normalised_error"]["value"]))
-        medians = [found[label, figure] for figure in bounds]
-        cells += [estimate(row["value"], row["standard_error"]) for row in medians]
-        table.add_row(Text(label), *cells, *([switches.get(label, "")] if switches else []))
-    yield table
+    yield _table("sets: runs that", [*headings, *(["switches"] if switches else [])], outcomes)
     yield ""
     yield Text(
         "violated: the truth left the set; emptied: a measurement left nothing of the set (noise "
-        "or remainder beyond what the filter believes); diverged: its set grew past `growth` times "
-        "its first width, or a value was lost; useless: no heading is excluded at some step; "
-        "error: (x-c)' S^-1 (x-c), 1 on the boundary; bounds: medians over runs of the mean over "
-        "time"
+        "or remainder beyond what the filter believes); diverged: a bound grew past `growth` times "
+        "the first one, or a value was lost; useless: the bound on an angle exceeds pi at some "
+        "step; "
+        "error: (x-c)' S^-1 (x-c), 1 on the boundary"
     )
+    units = manifest["states"]
+    bounds = {
+        label: [
+            estimate(row["value"], row["standard_error"])
+            for row in (found[label, MEDIAN_BOUND + state] for state in units)
+        ]
+        for label in labels
+    }
+    yield ""
+    headings = [f"{state}, {unit}" if unit else state for state, unit in units.items()]
+    yield _table("bounds (half-widths)", headings, bounds)
+    yield ""
+    yield Text("bounds: medians over runs of the mean over time; inf: half of the runs diverged")
     yield from map(Text, _of_noise(summary))
     yield from map(Text, _of_bounds(comparisons, manifest["compare_with"], found))
+
+
+def _table(first: str, headings: list[str], cells: Mapping[str, list[str]]) -> Table:
+    """A row per estimator."""
+    table = plain_table()
+    table.add_column(first, overflow="fold")
+    for heading in headings:
+        table.add_column(Text(heading), justify="right", no_wrap=True)
+    for label, row in cells.items():
+        table.add_row(Text(label), *row)
+    return table
 
 
 def largest(error: float) -> str:

@@ -22,18 +22,26 @@ HALVES = np.array([-0.5, 0.5])
 
 
 def draw_trajectory(tracks: Table, looks: Looks, information: RunInformation) -> Figure | None:
-    """One run in the plane (east, north), or its position over time if it has one dimension."""
+    """One run in the plane (east, north), or its position over time if it has one dimension.
+
+    Of states with units of their own there is a plane alone, of an x and a y in the same unit.
+    """
     if not len(tracks["case"]):
         return None
     case, run = (np.asarray(tracks[column])[0] for column in ("case", "run"))
     paths, plane = read_paths(tracks, case, run)
-    if not paths:
+    own = information.units
+    if not paths or (own is not None and not (plane and own.get("x") == own.get("y"))):
         return None
     errors = not plane and "truth" in paths
     rows, height, heights = (2, 4.2, (1, 1)) if errors else (1, 3.2, (1,))
     figure, (ax, *below) = panels(rows, 1, height, sharey=False, heights=heights)
     _plot_paths(ax, paths, looks, crosses_above=plane)
     leaving = _frame_trajectory(figure, ax, paths, plane)
+    if own is not None:
+        ax.set(xlabel=information.label("x"), ylabel=information.label("y"))
+        ax.xaxis.set_major_formatter(plain_numbers())
+        ax.yaxis.set_major_formatter(plain_numbers())
     if errors:
         leaving += [n for n in _plot_errors(below[0], paths, looks) if n not in leaving]
         ax.set_xlabel("")
@@ -55,6 +63,9 @@ def _plot_paths(ax: Axes, paths: Mapping[str, Array], looks: Looks, *, crosses_a
         ax.plot(*truth, color=TRUTH_COLOUR, linewidth=2.2, label="truth")
         ring: dict[str, Any] = {"color": TRUTH_COLOUR, "markerfacecolor": "white", "zorder": 5}
         ax.plot(*first, "o", label="first scan", **ring)
+    if "noise_free" in paths:
+        style: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "zorder": 0.8}
+        ax.plot(*paths["noise_free"], label="truth without noise", **style)
     for name, look in looks.items():
         if name in paths:
             plot_line(ax, paths[name][0], paths[name][1], look)
@@ -88,7 +99,7 @@ def _frame_trajectory(
     An estimate may widen the frame by half a span of the flight on each side and no more, so that
     a filter that runs away doesn't shrink the flight to a dot.
     """
-    flight = [paths[name] for name in ("truth", "measurement") if name in paths]
+    flight = [paths[name] for name in ("truth", "noise_free", "measurement") if name in paths]
     flown, everything = _extent(flight or paths.values()), _extent(paths.values())
     span = np.ptp(flown, axis=1)
     margin = 0.5 * (np.full(2, span.max()) if plane else span)

@@ -9,10 +9,11 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-MOST_DECIMALS = 6  # more than that, and figures of a million on, take an exponent
+MOST_DECIMALS = 7  # more than that, and figures of a million on, take an exponent
 MOST_DIGITS = 6  # of a figure with an exponent, after its point
 SHORTEST_NAME = 12  # what a narrow terminal leaves of a name's column; longer ones go on below
 WIDEST = 10_000
+ROUNDING = 1e-14  # relative; of sums over a run
 
 
 def figure(value: float, error: float) -> str:
@@ -21,7 +22,9 @@ def figure(value: float, error: float) -> str:
         return ""
     if math.isnan(error):
         return f"{value:.4g}"
-    if error == 0.0 or math.isinf(value) or math.isinf(error):
+    if math.isinf(value):
+        return f"{value:g}"
+    if error == 0.0 or math.isinf(error):
         return f"{value:.4g}±{error:.4g}"
     last = math.floor(math.log10(error))  # place of the error's first digit
     if max(abs(value), error) < 1e6 and -last <= MOST_DECIMALS:
@@ -32,8 +35,8 @@ def figure(value: float, error: float) -> str:
 
 
 def estimate(value: float, error: float) -> str:
-    """As `figure`; an error below the value's last bit is rounding, of what every run has alike."""
-    alike = math.isfinite(value) and error < math.ulp(value)
+    """As `figure`; an error that small is rounding, of what every run has alike."""
+    alike = math.isfinite(value) and error < ROUNDING * abs(value)
     return figure(value, 0.0 if alike else error)
 
 

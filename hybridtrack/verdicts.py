@@ -95,7 +95,7 @@ def judge_figure(claim: Claim, ours: Estimate, assumptions: bool) -> Outcome:
     if claim.sign is not None:
         assert claim.value is not None
         distance = Estimate(ours.value - claim.value, ours.standard_error, ours.n_runs)
-        return _outcome(claim, ours, _sign(claim, distance))
+        return _outcome(claim, ours, _sign(claim, distance, assumptions))
     return _outcome(claim, ours, _figure(claim, ours, assumptions))
 
 
@@ -135,19 +135,22 @@ def judge_comparison(claim: Claim, ours: Paired, assumptions: bool) -> Outcome:
     if claim.sign == "equal":
         return _outcome(claim, ours.ratio, _equality(claim, ours.ratio, assumptions))
     figure = ours.ratio if claim.value is not None else ours.difference
-    verdict = _sign(claim, ours.difference)
-    if verdict == REPRODUCED and claim.value is not None:
+    verdict = _sign(claim, ours.difference, assumptions)
+    if verdict in (REPRODUCED, ASSUMED) and claim.value is not None:
         met = _figure(claim, ours.ratio, assumptions)
         verdict = DIRECTION if met == NOT_REPRODUCED else met
     return _outcome(claim, figure, verdict)
 
 
-def _sign(claim: Claim, difference: Estimate) -> str:
-    """Whether a difference has the claimed sign by more than chance may do."""
+def _sign(claim: Claim, difference: Estimate, assumptions: bool) -> str:
+    """Whether a difference has the claimed sign by more than chance may do.
+
+    A sign stands for itself, unless whoever wrote the claim says that it rests on the assumptions.
+    """
     gap = difference.value if claim.sign == "greater" else -difference.value
     allowed = _allowed(difference)
     if gap > allowed:
-        return REPRODUCED
+        return ASSUMED if assumptions and claim.expect == ASSUMED else REPRODUCED
     return NOT_REPRODUCED if gap < -allowed else _undecided(difference)
 
 

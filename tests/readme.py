@@ -12,7 +12,6 @@ from rich.console import Console
 from hybridtrack import (
     config,
     dossiers,
-    experiment,
     results,
     tables,
     tables_of_analyses,
@@ -20,8 +19,8 @@ from hybridtrack import (
     typesetting,
 )
 from hybridtrack.analyses import analyses
-from hybridtrack.studies import analysis as studies
 from hybridtrack.studies.ledger import markdown
+from shipped import Shipped
 
 README = Path(__file__).parent.parent / "README.md"
 PART = re.compile(r"(<!-- generated: (?P<what>[^>]+) -->\n)(?P<text>.*?)(<!-- end -->)", re.DOTALL)
@@ -42,43 +41,31 @@ YARDSTICKS = {  # the same, with the most probable sequences on the truth's own 
 }
 
 
-def finished_runs(root: Path) -> dict[str, Path]:
+def finished_runs(shipped: Shipped) -> dict[str, Path]:
     """Every scenario that the README shows or that has published claims, at its full size."""
     folders = {}
     for name in config.shipped():
-        shipped = config.load(name)
-        if name in SHOWN or shipped.claims:
-            folders[name] = root / name
-            experiment.run(shipped, folders[name], 2, lambda done, total: None)
+        if name in SHOWN or config.load(name).claims:
+            folders[name] = shipped.run(name)
     for name, bound in (
         ("softbound_ex1", ", continuation_probability: 0.98"),
         ("softbound_ex3", ""),
     ):
         best = f"estimators.BEST={{type: best_sequences{bound}}}"
-        shipped = config.load(name, ["monte_carlo.runs=2400", best, "compare_with=BEST"])
-        folders[f"{name}+BEST"] = root / f"{name}+BEST"
-        experiment.run(shipped, folders[f"{name}+BEST"], 2, lambda done, total: None)
-    return folders | finished_analyses(root, folders)
+        folders[f"{name}+BEST"] = shipped.run(
+            name, "monte_carlo.runs=2400", best, "compare_with=BEST"
+        )
+    return folders | finished_analyses(shipped)
 
 
-def finished_analyses(root: Path, folders: dict[str, Path]) -> dict[str, Path]:
+def finished_analyses(shipped: Shipped) -> dict[str, Path]:
     """Every analysis that is shown, or that claims are on; `analyze NAME SCENARIO` by its words."""
     found = {}
     for name in config.shipped():
-        shipped = config.load(name)
-        claimed = {claim.analysis for claim in shipped.analysis_claims}
-        for analysis, one in analyses().items():
-            if analysis not in claimed and ANALYSED.get(analysis) != name:
-                continue
-            run = None
-            if one.wants_run is not None:
-                wanted = one.wants_run(shipped)
-                shipped = config.load(name, wanted)
-                run = root / f"{name}-for-{analysis}" if wanted else folders.get(name, root / name)
-                experiment.run(shipped, run, 2, lambda done, total: None)
-            words = f"analyze {analysis} {name}"
-            found[words] = root / words.replace(" ", "-")
-            studies.analyse(shipped, one, found[words], run)
+        claimed = {claim.analysis for claim in config.load(name).analysis_claims}
+        for analysis in analyses():
+            if analysis in claimed or ANALYSED.get(analysis) == name:
+                found[f"analyze {analysis} {name}"], _ = shipped.analysis(name, analysis)
     return found
 
 
@@ -118,14 +105,14 @@ def sets(folder: Path) -> str:
     """What came of the sets of a run's estimators."""
     rows = results.read_rows(folder, "sets")
     found = {(row["estimator"], row["figure"]): row for row in rows}
-    bounds = [f for f in dict.fromkeys(row["figure"] for row in rows) if f.startswith("median")]
     heads = [heading for _, heading in tables_of_sets.OUTCOMES] + ["largest error"]
-    heads += [f"bound on {figure.partition(':')[2]}" for figure in bounds]
+    units = results.require_complete(folder)["states"]
+    heads += [f"bound on {state}, {unit}" for state, unit in units.items()]
     lines = [f"| | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
     for label in dict.fromkeys(row["estimator"] for row in rows):
         cells = [f"{found[label, figure]['value']:,.0f}" for figure, _ in tables_of_sets.OUTCOMES]
         cells.append(tables_of_sets.largest(found[label, "largest_normalised_error"]["value"]))
-        medians = [found[label, figure] for figure in bounds]
+        medians = [found[label, tables_of_sets.MEDIAN_BOUND + state] for state in units]
         cells += [typesetting.figure(row["value"], row["standard_error"]) for row in medians]
         lines.append(f"| `{label}` | {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
@@ -156,7 +143,7 @@ def renewed(text: str, folders: dict[str, Path]) -> str:
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as temporary:
         README.write_text(
-            renewed(README.read_text("utf-8"), finished_runs(Path(temporary))), "utf-8"
+            renewed(README.read_text("utf-8"), finished_runs(Shipped(Path(temporary)))), "utf-8"
         )
     with contextlib.suppress(BrokenPipeError):
         sys.stdout.write(f"{README.name} renewed\n")

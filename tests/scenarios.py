@@ -150,6 +150,13 @@ def scenario_data(text: str, folder: Path) -> dict[str, Any]:
     return read(file).data
 
 
+def loaded(text: str, folder: Path, *changes: str) -> Experiment:
+    """The experiment of a scenario's text after settings."""
+    file = folder / "a.yaml"
+    file.write_text(text)
+    return load(file, changes)
+
+
 def complaint(text: str, file: Path, settings: tuple[str, ...] = ()) -> str:
     """What loading the scenario complains about."""
     file.write_text(text)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hybridtrack import bounded, ellipsoids, remainders
+from hybridtrack import bounded, ellipsoids, maps, remainders
 from hybridtrack import expressions as ex
 from hybridtrack.estimators import estimators
 from hybridtrack.nonlinear import NonlinearModel
@@ -18,20 +18,20 @@ STEPS = 314
 
 def system(texts, names=NAMES):
     """A compiled map of texts in the names of states."""
-    symbols = ex.symbols(names, "state")
+    symbols = maps.symbols(names, "state")
     env = dict(zip(names, symbols, strict=True))
-    return ex.compiled([ex.parse(text, env) for text in texts], symbols, ())
+    return maps.compiled([ex.parse(text, env) for text in texts], symbols, ())
 
 
 def aircraft(contains_box=False, dynamics=None, measurement=("x", "y")):
     """Otanez 2004, section IV; filters believe in 3 Q and 2 R where they contain the box."""
-    maps = system(dynamics or ("x + .1*cos(psi)", "y + .1*sin(psi)", "psi + .005"))
+    moved = system(dynamics or ("x + .1*cos(psi)", "y + .1*sin(psi)", "psi + .005"))
     seen = system(measurement)
     many = (3, 2) if contains_box else (1, 1)
     return NonlinearModel(
-        dynamics=maps,
+        dynamics=moved,
         measurement=seen,
-        dynamics_remainder=remainders.remainder(maps),
+        dynamics_remainder=remainders.remainder(moved),
         measurement_remainder=remainders.remainder(seen),
         state_names=NAMES,
         measurement_names=("x", "y"),

@@ -7,18 +7,11 @@ import pytest
 
 import reference
 from hybridtrack import blocks, estimators
-from hybridtrack.blocks import (
-    RAW,
-    TRUTH,
-    BlockTask,
-    inside,
-    merge,
-    run_block,
-    summarise,
-)
+from hybridtrack.blocks import inside, run_block
 from hybridtrack.config import Window
 from hybridtrack.errors import Stopped
 from hybridtrack.experiment import run as run_experiment
+from hybridtrack.groups import RAW, TRUTH, BlockTask, merge, summarise
 from hybridtrack.outcomes import paired
 from hybridtrack.roots import square_root
 from hybridtrack.simulation import (

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real processes, real folders."""
+"""The command line as a user meets it: real folders, and real processes where they matter."""
 
 import ast
 import json
@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
+
+from hybridtrack import cli, progress
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 HEAVY = {"numpy", "numba", "pandas", "matplotlib", "pydantic", "scipy", "pyarrow", "yaml"}
@@ -65,12 +67,10 @@ def test_help_imports_nothing_heavy(arguments, allowed):
     assert set(ast.literal_eval(done.stdout.splitlines()[-1])) <= allowed
 
 
-def test_every_command_has_help_with_examples(tmp_path):
-    from hybridtrack.cli import app
-
-    for command in app.registered_commands:
+def test_every_command_has_help_with_examples(tmp_path, said):
+    for command in cli.app.registered_commands:
         name = command.name or command.callback.__name__
-        done = hybridtrack(name, "--help", cwd=tmp_path)
+        done = said(name, "--help", cwd=tmp_path)
         assert done.returncode == 0
         assert f"  hybridtrack {name}" in done.stdout.partition("Examples:")[2]
         assert max(map(len, done.stdout.splitlines())) <= 80
@@ -219,17 +219,24 @@ def test_out_names_the_folder_and_other_runs_are_safe_in_it(tmp_path):
         (["run", "rmimm_fig5", "--out", "/dev/null/x", "--runs", "2", "-q"], ["/dev/null/x"]),
     ],
 )
-def test_bad_input_is_one_sentence(tmp_path, arguments, words):
-    sentence = one_sentence(hybridtrack(*arguments, cwd=tmp_path))
+def test_bad_input_is_one_sentence(tmp_path, said, arguments, words):
+    sentence = one_sentence(said(*arguments, cwd=tmp_path))
     for word in words:
         assert word in sentence
+
+
+def test_a_process_says_the_same_as_its_command_here(tmp_path, said):
+    for arguments in (["run", "rmimm_fig6"], ["plot", "."], ["list", "motions"], ["schema"]):
+        there, here = hybridtrack(*arguments, cwd=tmp_path), said(*arguments, cwd=tmp_path)
+        assert (here.returncode, here.stdout) == (there.returncode, there.stdout)
+        assert here.stderr == there.stderr
 
 
 @pytest.mark.parametrize(
     "arguments", [["fly"], ["run"], ["run", "rmimm_fig5", "--runs", "many"], ["run", "--what"]]
 )
-def test_wrong_usage_exits_with_2_and_no_traceback(tmp_path, arguments):
-    done = hybridtrack(*arguments, cwd=tmp_path)
+def test_wrong_usage_exits_with_2_and_no_traceback(tmp_path, said, arguments):
+    done = said(*arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert "Usage:" in done.stderr
@@ -380,10 +387,14 @@ def test_an_interrupt_tells_what_is_kept(tmp_path):
     assert "finished shards are kept in" in _what_is_kept(tmp_path)
 
 
-def start_long_run(cwd, runs="2000000"):
+OURS = ("-m", "hybridtrack")
+
+
+def start_long_run(cwd, program=OURS):
     """A run of many minutes, once it has finished its first shard."""
+    arguments = ["run", "rmimm_fig5", "--runs", "2000000", "--out", "long"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "hybridtrack", "run", "rmimm_fig5", "--runs", runs, "--out", "long"],
+        [sys.executable, *program, *arguments],
         cwd=cwd,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -417,12 +428,17 @@ def test_interrupt_is_one_line_and_130_and_keeps_what_is_finished(tmp_path):
 
 
 def test_plain_progress_without_a_terminal(tmp_path):
-    process = start_long_run(tmp_path)
-    time.sleep(6)  # a plain line comes every five seconds
+    """A plain line every five seconds, here every one."""
+    assert progress.QUIET_S == 5.0
+    begun = time.monotonic()
+    code = "from hybridtrack import cli, progress; progress.QUIET_S = 1.0; cli.main()"
+    process = start_long_run(tmp_path, ("-c", code))
+    time.sleep(2)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
-    assert "of 2,000,000 runs" in err
-    assert "s left" in err
+    lines = [line for line in err.splitlines() if "of 2,000,000 runs, " in line]
+    assert all(line.endswith(" s left") for line in lines)
+    assert 1 <= len(lines) <= time.monotonic() - begun
     assert "\x1b" not in err
 
 

@@ -14,9 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from hybridtrack import experiment as room
-from hybridtrack.blocks import BlockTask, run_block, summarise
+from hybridtrack.blocks import run_block
 from hybridtrack.config import load
 from hybridtrack.experiment import digest, is_complete, plan, run
+from hybridtrack.groups import BlockTask, summarise
 from hybridtrack.outcomes import paired
 from hybridtrack.results import (
     RunFolder,

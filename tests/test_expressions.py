@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridtrack import expressions as ex
+from hybridtrack import maps
 from set_models import NAMES, system
 
 NONE = np.zeros(0)
-SYMBOLS = dict(zip(NAMES, ex.symbols(NAMES, "state"), strict=True))
+SYMBOLS = dict(zip(NAMES, maps.symbols(NAMES, "state"), strict=True))
 
 
 def value(text, **names):
@@ -165,7 +166,7 @@ def test_what_is_unknown_is_refused_after_differentiation_too():
     x = SYMBOLS["x"]
     for one, said in ((sympy.Abs(x), "a kink"), (sympy.gamma(x), "not known here")):
         with pytest.raises(ex.ExpressionError, match=said) as caught:
-            ex.compiled([x, one], (x,), ())
+            maps.compiled([x, one], (x,), ())
         assert caught.value.component == 1
 
 
@@ -181,9 +182,9 @@ def test_no_expression_is_multiplied_out_at_length():
     nested = f"((({inside} + 1)**20 + 1)**20 + 1)**20"
     for text in (f"cos({inside}*{inside})", f"1/({inside} + 1)**20", f"x*cos({inside})", nested):
         map_ = system((text,))
-        assert ex._terms(map_.expressions[0]) > ex.MOST_TERMS, text
-        assert ex.waves(map_) == (None,)
-    found = ex.waves(system(("2*(x + 3*(cos(psi) + 4*(y + 1)))", "(x + 1)**2 - x**2")))
+        assert maps._terms(map_.expressions[0]) > maps.MOST_TERMS, text
+        assert maps.waves(map_) == (None,)
+    found = maps.waves(system(("2*(x + 3*(cos(psi) + 4*(y + 1)))", "(x + 1)**2 - x**2")))
     assert [len(one) for one in found] == [1, 0]
 
 

@@ -18,6 +18,7 @@ name: aircraft
 clock: {step_s: 0.01, duration_s: 0.6}
 states: [x, y, psi]
 angles: [psi]
+units: {x: m, y: m}
 constants: {T: 0.01, v1: 10, w1: 0.5}
 inputs: {v0: 0}
 dynamics:
@@ -72,6 +73,10 @@ MISTAKES = [
     ("measurement: {x: x, y: y}", "measurement: {x: x, y: z}", "'z' is not known"),
     ("measurement: {x: x, y: y}", "measurement: {}", "'measurement' has no entries"),
     ("angles: [psi]", "angles: [phi]", "'phi' is no state"),
+    ("units: {x: m,", "units: {q: m,", "'q' is no state and no measurement"),
+    ("units: {x: m,", "units: {psi: deg, x: m,", "are in rad, and its unit is deg"),
+    ("x + T*(-v0 + v1*cos(psi))", "(x + 1)**2", "has no finite value at step"),
+    ("  EKF: {type: ekf}", "  noise_free: {type: ekf}", "means something else"),
     ("constants: {T: 0.01,", "constants: {T: 0.01, x: 1,", "'x' is among the states already"),
     ("constants: {T: 0.01,", "constants: {T: 0.01, cos: 1,", "'cos' has a meaning"),
     ("constants: {T: 0.01,", "constants: {T: 0.01, lambda: 1,", "cannot stand in an expression"),
@@ -180,6 +185,94 @@ def test_metrics_are_there_where_they_apply(finished):
     assert set(summary.window) == {"all", "late"}
 
 
+def test_errors_of_every_state_are_scored(finished):
+    """Against a plain mean over the runs' and steps' own errors, from the kept tracks."""
+    _, folder = finished
+    summary = read_table(folder, "summary").set_index(["estimator", "metric", "window"]).value
+    runs = read_table(folder, "runs")
+    runs = runs[(runs.window == "all") & (runs.estimator == "EKF")]
+    tracks = read_table(folder, "tracks").pivot_table("value", "step", ["estimator", "quantity"])
+    for state in ("x", "y", "psi"):
+        squares = ((tracks["EKF", state] - tracks["truth", state]) ** 2).sum()
+        of_run = runs.loc[runs.run == 0, f"squared_error:{state}_sum"].item()
+        assert of_run == pytest.approx(squares, rel=1e-9)
+        mean = runs[f"squared_error:{state}_sum"].sum() / runs[f"squared_error:{state}_count"].sum()
+        assert summary["EKF", f"mse:{state}", "all"] == pytest.approx(mean, rel=1e-12)
+        assert summary["EKF", f"rmse:{state}", "all"] == pytest.approx(mean**0.5, rel=1e-12)
+    both = sum(summary["EKF", f"mse:{state}", "all"] for state in "xy")
+    assert summary["EKF", "position_mse_m2", "all"] == pytest.approx(both, rel=1e-12)
+
+
+def test_positions_are_scored_in_metres_only(tmp_path, capsys):
+    from rich.console import Console
+
+    _, folder = run(tmp_path, text=AIRCRAFT.replace("units: {x: m, y: m}", "units: {x: ft, y: ft}"))
+    assert not any("position" in metric for metric in read_table(folder, "summary").metric)
+    tables.show(folder, Console(width=80))
+    said = capsys.readouterr().out
+    assert "RMS, ft" in said
+    assert "RMS, rad" in said
+    assert "RMS, m" not in said
+
+
+def test_the_course_without_noise_is_kept(finished):
+    one, folder = finished
+    course = one.nonlinear.course(one.cases[0].truth.start, 60)[1:]
+    tracks = read_table(folder, "tracks")
+    for e, state in enumerate(one.nonlinear.state_names):
+        mine = tracks[(tracks.estimator == "noise_free") & (tracks.quantity == state)]
+        np.testing.assert_array_equal(mine.value, course[:, e])
+
+
+def test_missed_scans_are_predicted_over(tmp_path):
+    """Half of them: bounds are wider, and the truth is still contained; raw is scored at scans."""
+    chosen = ("noise.detection_probability=0.5", "monte_carlo.keep_tracks=40")
+    _, folder = run(tmp_path, settings_=chosen)
+    tracks = read_table(folder, "tracks")
+    seen = tracks[(tracks.estimator == "measurement") & (tracks.quantity == "x")].value.notna()
+    assert abs(seen.mean() - 0.5) < 4 * np.sqrt(0.25 / seen.size)  # k = 4
+    sets = read_table(folder, "sets").set_index(["estimator", "figure"]).value
+    assert sets["ESMF", "violated_runs"] == 0
+    summary = read_table(folder, "summary").set_index(["estimator", "metric", "window"]).value
+    assert summary["raw", "position_rmse_m", "all"] == pytest.approx(0.09, rel=1e-9)
+    _, complete = run(tmp_path, "complete")
+    wider = read_table(complete, "summary").set_index(["estimator", "metric", "window"]).value
+    bound = ("ESMF", "mean_bound:x", "all")
+    assert summary[bound] > wider[bound]
+
+
+RUNS_AWAY = """\
+name: runs_away
+clock: {step_s: 1, duration_s: 60}
+states: [x]
+dynamics: {x: x**2}
+measurement: {x: x}
+truth: {start: [0.9]}
+noise: {kind: ball, process: {x: 0.2}, measurement: {x: 0.1}}
+initial: {mean: truth, half_axes: {x: 0.1}}
+estimators: {ESMF: {type: esmf}, EKF: {type: ekf}}
+compare_with: EKF
+monte_carlo: {runs: 40, seed: 1}
+"""
+
+
+def test_a_truth_that_runs_away_is_told_and_left_out(tmp_path, capsys):
+    from rich.console import Console
+
+    _, folder = run(tmp_path, text=RUNS_AWAY)
+    runs = read_table(folder, "runs").set_index(["estimator", "run"]).status
+    lost = runs["raw"] > 0
+    assert 0 < lost.sum() < 40
+    for label in ("ESMF", "EKF"):
+        assert (runs[label][lost] > 0).all()
+        assert (runs[label][lost] <= runs["raw"][lost]).all()
+    summary = read_table(folder, "summary")
+    assert np.isfinite(summary.value).all()
+    tables.show(folder, Console(width=200))
+    said = capsys.readouterr().out
+    assert f"raw: in {lost.sum()} of 40 runs the truth itself runs away" in " ".join(said.split())
+
+
 def test_steps_have_bounds_and_models(finished):
     _, folder = finished
     steps = read_table(folder, "steps")
@@ -214,8 +307,8 @@ def test_the_printed_output_says_what_came_of_the_sets(finished, capsys):
     assert "leaves its ellipsoid" not in said
     told = " ".join(said.split())
     assert "emptied: a measurement left nothing of the set (noise or remainder beyond" in told
-    assert "diverged: its set grew past `growth` times its first width, or a value was" in told
-    assert "useless: no heading is excluded at some step" in told
+    assert "diverged: a bound grew past `growth` times the first one, or a value was" in told
+    assert "useless: the bound on an angle exceeds pi at some step" in told
     assert json.dumps(tables.as_json(folder)["sets"][0])
 
 
@@ -265,7 +358,7 @@ def test_figures_are_drawn(finished):
 
     _, folder = finished
     names = {path.stem for path in pictures.draw_run(folder)}
-    assert {"trajectory", "bound", "operating_points", "model_chosen"} <= names
+    assert {"trajectory", "sets", "bound", "operating_points", "model_chosen"} <= names
 
 
 def test_a_baseline_holds_set_figures_too(tmp_path, monkeypatch):

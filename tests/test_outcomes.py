@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from hybridtrack import outcomes
-from hybridtrack.blocks import BlockTask, merge, run_block, summarise
+from hybridtrack.blocks import run_block
 from hybridtrack.config import load
 from hybridtrack.experiment import _pack, _unpack
+from hybridtrack.groups import BlockTask, merge, summarise
 from hybridtrack.simulation import BlockSimulation
 from hybridtrack.statistics import POSITION, Moments
 from hybridtrack.tallies import BINS

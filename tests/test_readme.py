@@ -1,18 +1,12 @@
 """The README says what the commands print today, and names every command and scenario."""
 
-import pytest
-
 import readme
 from hybridtrack.catalogue import catalogue
 from hybridtrack.cli import app
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    return readme.finished_runs(tmp_path_factory.mktemp("readme"))
-
-
-def test_generated_parts_are_what_the_commands_print_today(folders):
+def test_generated_parts_are_what_the_commands_print_today(shipped):
+    folders = readme.finished_runs(shipped)
     text = readme.README.read_text("utf-8")
     assert readme.renewed(text, folders) == text, "run `make ledger`"
 

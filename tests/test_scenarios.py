@@ -18,30 +18,19 @@ def quiet(done, total):
     pass
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """The recorded flight, run as shipped."""
-    path = tmp_path_factory.mktemp("recorded") / "run"
-    shipped = config.load("recorded_flight")
-    experiment.run(shipped, path, 2, quiet)
-    return shipped, path
-
-
 @pytest.mark.parametrize("name", sorted(config.shipped()))
-def test_every_scenario_runs_and_every_verdict_is_the_expected_one(name, tmp_path):
-    shipped = config.load(name)
-    experiment.run(shipped, tmp_path / name, 2, quiet)
-    assert results.require_complete(tmp_path / name)["diverged"] == {}
-    for row in results.read_rows(tmp_path / name, "published"):
+def test_every_scenario_runs_and_every_verdict_is_the_expected_one(name, shipped):
+    folder = shipped.run(name)
+    assert results.require_complete(folder)["diverged"] == {}
+    for row in results.read_rows(folder, "published"):
         expected = {row["expected_verdict"]}
         if (name, row["claim"]) in NARROW:
             expected.add(UNDECIDED)
         assert row["verdict"] in expected, row
 
 
-def test_the_recorded_flight_is_what_it_was(flight):
-    shipped, _ = flight
-    (case,) = shipped.cases
+def test_the_recorded_flight_is_what_it_was():
+    (case,) = config.load("recorded_flight").cases
     step_s = np.diff(case.times_s)
     assert 4000 < len(step_s) < 4300
     assert step_s.min() >= 4.0
@@ -49,18 +38,18 @@ def test_the_recorded_flight_is_what_it_was(flight):
     assert np.isfinite(case.truth.state).all()
 
 
-def test_two_models_beat_one_on_the_recorded_flight(flight):
+def test_two_models_beat_one_on_the_recorded_flight(shipped):
     """Ratio of position RMSE below .97 by three standard errors, over 20 noise seeds."""
-    _, path = flight
-    ratio = outcomes.paired(path, "IMM", "KF", "position_rmse_m", "all").ratio
+    folder = shipped.run("recorded_flight")
+    ratio = outcomes.paired(folder, "IMM", "KF", "position_rmse_m", "all").ratio
     assert ratio.n_runs == 20
     assert ratio.value + 3 * ratio.standard_error < 0.97
 
 
-def test_no_other_single_filter_does_better(flight, tmp_path):
+def test_no_other_single_filter_does_better(shipped, tmp_path):
     """The Kalman filter compared with has the best psd of 1, 3, 10 and 30 m^2/s^3."""
-    _, path = flight
-    summary = read_table(path, "summary").set_index(["estimator", "metric", "window"])
+    summary = read_table(shipped.run("recorded_flight"), "summary")
+    summary = summary.set_index(["estimator", "metric", "window"])
     best = summary.loc[("KF", "position_rmse_m", "all"), "value"]
     for psd in (1, 3, 10):
         other = config.load("recorded_flight", [f"modes.any.acceleration_psd_m2_s3={psd}"])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import reference
-from hybridtrack.blocks import BlockTask, run_block
+from hybridtrack.blocks import run_block
 from hybridtrack.config import load
+from hybridtrack.groups import BlockTask
 from models import SMALL, scenario
 from test_blocks import simulated, slow_start
 

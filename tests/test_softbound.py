@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from hybridtrack import config, experiment, outcomes, results
-from hybridtrack.blocks import BlockTask, run_block
+from hybridtrack.blocks import run_block
+from hybridtrack.groups import BlockTask
 from hybridtrack.statistics import reliability, vector_moments
 from hybridtrack.tallies import BINS
 

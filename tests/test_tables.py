@@ -29,6 +29,7 @@ def folder(tmp_path):
         "windows": ["all", "turn", "nowhere"],
         "compare_with": None,
         "error": "rmse",
+        "states": {},
     }
     (tmp_path / results.MANIFEST).write_text(json.dumps(manifest))
     rows = [
@@ -84,9 +85,9 @@ def shown(folder, width, terminal=False):
         (5.0, 2e7, "5e+00±2e+07"),
         (0.0, 3e-8, "0e+00±3e-08"),
         (1.0, 1e-300, "1.000000e+00±1e-300"),
-        (math.inf, math.inf, "inf±inf"),
+        (math.inf, math.inf, "inf"),
         (1.0, math.inf, "1±inf"),
-        (-math.inf, 0.1, "-inf±0.1"),
+        (-math.inf, 0.1, "-inf"),
     ],
 )
 def test_a_figure_to_the_first_digit_of_its_error(value, error, text):
@@ -104,15 +105,16 @@ def test_counts_agree_with_their_noun():
     [
         (0.6894482687867965, 1.2e-18, "0.6894±0"),
         (-0.6894482687867965, 1.2e-18, "-0.6894±0"),
-        (0.5, 2e-16, "5.000000e-01±2e-16"),
+        (0.09, 2e-17, "0.09±0"),
+        (0.5, 2e-12, "5.000000e-01±2e-12"),
         (0.0, 3e-8, "0e+00±3e-08"),
         (17.94, 0.04, "17.94±0.04"),
         (0.6, math.nan, "0.6"),
         (math.nan, math.nan, ""),
-        (math.inf, 0.1, "inf±0.1"),
+        (math.inf, 0.1, "inf"),
     ],
 )
-def test_an_error_below_the_last_bit_is_none(value, error, told):
+def test_an_error_of_rounding_is_none(value, error, told):
     assert typesetting.estimate(value, error) == told
 
 
@@ -136,7 +138,7 @@ def test_a_terminal_folds_names_and_keeps_figures_whole(folder):
         text = shown(folder, width, terminal=True)
         rows = text.partition("─")[2].partition("windows")[0]
         assert all(figure in rows for figure in FIGURES)
-        folded = "".join(line.split(" ")[0] for line in rows.splitlines()[2:])
+        folded = "".join(line.split(" ")[0] for line in rows.splitlines()[1:])
         assert folded == LONG
         if width == 110:
             assert max(map(len, rows.splitlines())) <= width

@@ -88,6 +88,10 @@ def test_a_figure_on_one_side_of_a_bound(sign, value, verdict):
     given = claim(18.0, 0.5)._replace(sign=sign)
     ours = Estimate(value, 1 / 3, MANY)
     assert judge_figure(given, ours, assumptions=True).verdict == verdict
+    resting = given._replace(expect=ASSUMED)  # the sign itself rests on what was assumed
+    rests = ASSUMED if verdict == REPRODUCED else verdict
+    assert judge_figure(resting, ours, assumptions=True).verdict == rests
+    assert judge_figure(resting, ours, assumptions=False).verdict == verdict
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from hybridtrack.errors import Unsuited
 from hybridtrack.models import Array, JumpMarkovModel
 from hybridtrack.roots import thin_square_root
 
+EQUILIBRATED = 2  # times, after which units don't matter any more
 RANK_TOLERANCE = 1e-9  # of the largest singular value, columns being normalised
 SAME_TOLERANCE = 1e-12  # relative: variances that differ by less, in any direction, are equal
 ROUNDING = 1e-13  # of the largest variance: what rounding leaves of differences
@@ -93,16 +94,32 @@ def _powers(state_transition: Array, measurement_matrix: Array, scans: int) -> A
 def observability_index(state_transition: Array, measurement_matrix: Array) -> float:
     """The smallest number of scans k with rank O_k = n_x; inf where there is none.
 
-    Columns are normalised first, so that units of states don't matter; singular values below
+    Columns and outputs are normalised first, so that no units matter; singular values below
     RANK_TOLERANCE of the largest are zero. By Cayley and Hamilton no more than n_x scans help.
     Source: Hwang 2003, before lemma 2.
     """
     n_x = len(state_transition)
+    outputs = _outputs_alike(state_transition, measurement_matrix)
     for scans in range(1, n_x + 1):
-        matrix = observability_matrix(state_transition, measurement_matrix, scans)
+        matrix = observability_matrix(state_transition, outputs, scans)
         if rank(matrix) == n_x:
             return float(scans)
     return math.inf
+
+
+def _outputs_alike(state_transition: Array, measurement_matrix: Array) -> Array:
+    """H with outputs in units of their own, such that each is of size 1 in the states' own units.
+
+    Not row by row of O, which would make something of a later scan's rounding.
+    """
+    outputs = measurement_matrix
+    for _ in range(EQUILIBRATED):
+        matrix = observability_matrix(state_transition, outputs, len(state_transition))
+        states = np.abs(matrix).max(axis=0, initial=0.0)
+        states[states == 0.0] = 1.0
+        sizes = np.abs(outputs / states).max(axis=1, keepdims=True)
+        outputs = outputs / np.where(sizes > 0.0, sizes, 1.0)
+    return outputs
 
 
 def observability_indices(model: JumpMarkovModel) -> tuple[float, ...]:

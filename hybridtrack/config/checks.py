@@ -11,7 +11,7 @@ from hybridtrack.models import Array
 
 ROUNDING = 1e-9  # what decimals written by hand may leave over
 # Rows of the tables, and how the figures' legends call them.
-TAKEN_LABELS = ("raw", "truth", "measurement", "measurements")
+TAKEN_LABELS = ("raw", "truth", "measurement", "measurements", "noise_free")
 
 
 def nearest(given: Any, names: Sequence[str]) -> str:

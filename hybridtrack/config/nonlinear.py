@@ -14,26 +14,24 @@ from hybridtrack.config.nonlinear_form import NonlinearForm
 from hybridtrack.config.reader import Document, Keys, shown
 from hybridtrack.config.truths import times_of
 from hybridtrack.description import ChosenEstimator, Experiment, Initial
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Unsuited, UserError
 from hybridtrack.estimators import estimators
 from hybridtrack.expressions import (
     FUNCTIONS,
     KNOWN_NUMBERS,
     ExpressionError,
-    Map,
-    compiled,
-    constants_of_states,
-    not_finite,
     number,
     parse,
-    symbols,
 )
+from hybridtrack.maps import Map, compiled, constants_of_states, not_finite, symbols
 from hybridtrack.models import Array, ModeBank
 from hybridtrack.nonlinear import NonlinearModel
 from hybridtrack.remainders import remainder
 from hybridtrack.sensors import Sensor
 from hybridtrack.simulation import Case, step_lengths
 
+RADIANS = "rad"
+LARGEST_STATE = 1e30  # a truth beyond it runs away
 MOST_STEPS = 100_000  # of a nonlinear course, which Python steps through
 
 
@@ -53,6 +51,7 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
     truth = _truth(form, model, document)
     _check_inputs(model, tuple(form.inputs), document)
     _check_start(model, truth.start, document)
+    _check_course(model, truth.start, times_s, document)
     case = Case(form.name, times_s, truth)
     nothing = ModeBank((), model.state_names, 1, None, None, np.zeros(0))
     chosen = tuple(_estimator(label, form, model, nothing, document) for label in form.estimators)
@@ -83,7 +82,27 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
         resolved=_resolved(form, claims),
         nonlinear=model,
         point_names=point_names(form),
+        units=_units(form, document),
     )
+
+
+def _units(form: NonlinearForm, document: Document) -> dict[str, str]:
+    """Units by name of state or measurement; an angle is in radians, the rest as written."""
+    known = tuple(dict.fromkeys([*form.states, *form.measurement]))
+    for name in form.units:
+        if name not in known:
+            raise document.error(
+                ("units", name),
+                f"'{shown(name)}' is no state and no measurement; {checks.nearest(name, known)}",
+            )
+    for angle in form.angles:
+        if form.units.get(angle, RADIANS) != RADIANS:
+            raise document.error(
+                ("units", angle),
+                f"'{angle}' is among the angles, which are in {RADIANS}, and its unit is "
+                f"{shown(form.units[angle])}; remove one",
+            )
+    return dict.fromkeys(form.angles, RADIANS) | form.units
 
 
 # ---- the maps --------------------------------------------------------------------------------
@@ -207,6 +226,20 @@ def _check_start(model: NonlinearModel, start: Array, document: Document) -> Non
                     )
 
 
+def _check_course(model: NonlinearModel, start: Array, times_s: Array, document: Document) -> None:
+    """The truth keeps its value to the end, at least without noise."""
+    with np.errstate(all="ignore"):
+        course = model.course(start, len(times_s) - 1)
+        lost = ~(np.abs(course).max(axis=1) < LARGEST_STATE)
+    if lost.any():
+        k = int(np.argmax(lost))
+        raise document.error(
+            ("dynamics",),
+            f"without noise the truth has no finite value at step {k} ({times_s[k]:g} s); end "
+            "'clock' before, or change 'dynamics' or 'start'",
+        )
+
+
 def _check_inputs(model: NonlinearModel, names: tuple[str, ...], document: Document) -> None:
     """What the maps make of inputs alone has a finite value at all of their values."""
     rows = np.unique(model.inputs, axis=0)
@@ -287,6 +320,7 @@ def _truth(form: NonlinearForm, model: NonlinearModel, document: Document) -> Bo
         process=Noise(noise.kind, process, noise.hold_steps),
         measurement=Noise(noise.kind, measured, noise.hold_steps),
         against=noise.against,
+        detection_probability=noise.detection_probability,
     )
 
 
@@ -321,7 +355,8 @@ def _estimator(
         estimator.prepare(settings, model)
     except UserError as error:
         said = str(error).rstrip(".")
-        raise document.error(("estimators", label), f"'{label}': {said}") from None
+        keys = error.keys if isinstance(error, Unsuited) else ()
+        raise document.error(("estimators", label, *keys), f"'{label}': {said}") from None
     return ChosenEstimator(label, estimator, settings, bank)
 
 

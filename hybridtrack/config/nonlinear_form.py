@@ -23,6 +23,7 @@ from hybridtrack.config.schema import (
 from hybridtrack.estimators import estimators
 
 Expression = str | float
+Unit = Annotated[str, Field(min_length=1, max_length=12)]
 
 if TYPE_CHECKING:
     SetEstimatorUnion: TypeAlias = Any
@@ -56,6 +57,7 @@ class NoiseForm(Form):
     hold_steps: Annotated[int, Field(ge=1, le=10**9)] = 40
     against: str | None = None
     contains_box: bool = False
+    detection_probability: Annotated[float, Field(gt=0, le=1)] = 1.0  # of a whole scan
 
 
 class StartForm(Form):
@@ -75,6 +77,7 @@ class NonlinearForm(Form):
     clock: ClockForm
     states: Annotated[list[Name], Field(min_length=1, max_length=12)]
     angles: list[str] = Field(default_factory=list)
+    units: dict[str, Unit] = Field(default_factory=dict)  # of states and measurements, as written
     constants: dict[Name, float] = Field(default_factory=dict)
     inputs: dict[Name, float | list[float]] = Field(default_factory=dict)
     dynamics: dict[str, Expression]

@@ -28,7 +28,7 @@ from hybridtrack.ellipsoids import (
     trace,
     update,
 )
-from hybridtrack.errors import UserError
+from hybridtrack.errors import Unsuited
 from hybridtrack.estimators import NO_KNOWN_MODES, Estimates
 from hybridtrack.estimators._sets import Nonlinear, Sets, blank, estimates, note_points
 from hybridtrack.models import Array
@@ -50,8 +50,9 @@ class Settings(NamedTuple):
 
     criterion: what chooses in a bank, of the ellipsoid (sigma) or of the noise with the remainder
     (q). remainder, box, form: see the module and its rooms. beta: by the smallest trace, or a
-    number; rho: a number, or by the smallest trace or determinant. growth: a run whose ellipsoid is
-    this many times as wide as its first has diverged.
+    number; rho: a number, or by the smallest trace or determinant. growth: a run has diverged whose
+    bound on a state is this many times the first one, or the half-axis of the state's process noise
+    where that is larger.
     """
 
     operation: Literal["relinearised", "bank_parallel", "bank_reset"] = "relinearised"
@@ -109,7 +110,8 @@ class Running:
             np.tile(model.initial_shape, (self._count * self._lanes, 1, 1)),
             np.zeros(self._count * self._lanes),
         )
-        self._limit = settings.growth**2 * float(trace(model.initial_shape))
+        first = np.maximum(half_widths(model.initial_shape), half_widths(model.process_noise_shape))
+        self._limit = settings.growth * first  # (n_x,)
         self._step = 0
         self._diverged = np.zeros(self._lanes, dtype=np.bool_)
         self.mode_names: tuple[str, ...] = ()
@@ -245,8 +247,7 @@ class Running:
         row = chosen * lanes + np.arange(lanes)
         sets = self.sets
         mean[k], shape = step.filters.centre[row].T, bound[row]
-        wide = trace(shape)
-        self._diverged |= ~(wide <= self._limit)
+        self._diverged |= ~(half_widths(shape) <= self._limit).all(axis=1)
         mean[k][:, self._diverged] = np.nan
         sets.shape[k] = np.moveaxis(shape, 0, -1)
         sets.chosen[k] = chosen
@@ -276,26 +277,30 @@ class SetMembershipFilter(Nonlinear):
         """The model as it is; the settings are checked against it."""
         n_x = len(model.state_names)
         if settings.operation == "relinearised" and settings.operating_points:
-            raise UserError(
+            raise Unsuited(
                 "a relinearised filter has no 'operating_points'; remove them, or set 'operation' "
-                "to bank_reset"
+                "to bank_reset",
+                "operating_points",
             )
         if settings.operation != "relinearised" and not settings.operating_points:
-            raise UserError(
+            raise Unsuited(
                 f"'operation' {settings.operation} needs 'operating_points', a list of states such "
-                f"as [{', '.join('0' * n_x)}]; add it"
+                f"as [{', '.join('0' * n_x)}]; add it",
+                "operation",
             )
-        for point in settings.operating_points:
+        for i, point in enumerate(settings.operating_points):
             if len(point) != n_x:
-                raise UserError(
+                raise Unsuited(
                     f"an operating point has {len(point)} numbers and needs one for each of the "
-                    f"states {' '.join(model.state_names)}"
+                    f"states {' '.join(model.state_names)}",
+                    "operating_points",
+                    i,
                 )
         for key in ("beta", "rho"):
             weight = getattr(settings, key)
             if not isinstance(weight, str) and not 0.0 < weight < 1.0:
-                raise UserError(
-                    f"'{key}' is {weight:g}; give a number between 0 and 1, without both"
+                raise Unsuited(
+                    f"'{key}' is {weight:g}; give a number between 0 and 1, without both", key
                 )
         return model
 

@@ -9,9 +9,10 @@ import threading
 
 import pytest
 
-from hybridtrack.blocks import BlockTask, run_block, summarise
+from hybridtrack.blocks import run_block
 from hybridtrack.config import load
 from hybridtrack.experiment import run
+from hybridtrack.groups import BlockTask, summarise
 from hybridtrack.outcomes import paired
 from hybridtrack.statistics import METRICS, ratio_of_sums
 
