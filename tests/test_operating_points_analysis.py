@@ -255,7 +255,10 @@ LINEAR = ("dynamics.x=x + T*v1", "dynamics.y=y")
         ([f"{SETTING}placements={{mine: [[0, 1]]}}"], ("needs 1 number for each",)),
         ([f"{SETTING}placements={{optimal: [1]}}"], ("can't be called 'optimal'",)),
         (["dynamics.x=x + 1/(psi - 1)"], ("no value at psi = 1",)),
-        (["dynamics.x=x + log(1.2 - psi)"], ("no value at psi = 1.2",)),
+        (
+            ["dynamics.x=x + log(1.8 - psi)", f"{SETTING}range={{psi: [0, 2]}}"],
+            ("no value at psi = 1.8",),
+        ),
         (["measurement={x: x}", "noise.measurement={x: 0.09}", LINEAR[0]], ("no steady state",)),
         (
             ["inputs.v0=[" + ", ".join(["1", "2"] * 157) + "]", "dynamics.y=y + T*v0*sin(psi)"],
