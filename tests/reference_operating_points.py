@@ -41,9 +41,9 @@ def worst_error(error, points, low=LOW, high=HIGH, places=40_001):
     return np.min([error(x, c) for c in points], axis=0).max()
 
 
-def exhaustive(error, count, grid, places=401):
+def exhaustive(error, count, grid, places=401, low=LOW, high=HIGH):
     """The best `count` points of a grid, all combinations of them tried."""
-    x = np.linspace(LOW, HIGH, places)
+    x = np.linspace(low, high, places)
     table = np.array([error(x, c) for c in grid])
     best, chosen = np.inf, None
     for rest in itertools.combinations(range(len(grid)), count - 1):
@@ -55,6 +55,20 @@ def exhaustive(error, count, grid, places=401):
         if worst.min() < best:
             best, chosen = worst.min(), (*rest, begin + int(worst.argmin()))
     return best, grid[list(chosen)]
+
+
+def worst_of_squares(points, side=401):
+    """max(|x - a|, |y - b|)^2 over the unit square, of the nearest of points (n, 2)."""
+    x, y = np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side))
+    return np.min([np.maximum((x - a) ** 2, (y - b) ** 2) for a, b in points], axis=0).max()
+
+
+def best_pair_for_a_product(low, high, points=13, places=61):
+    """x y is off its tangent at (a, b) by (x - a)(y - b): the best two points of a grid."""
+    x, y = np.meshgrid(*(np.linspace(a, b, places) for a, b in zip(low, high, strict=True)))
+    sides = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+    tables = [np.abs((x - a) * (y - b)).ravel() for a, b in itertools.product(*sides)]
+    return min(np.minimum(one, two).max() for one, two in itertools.combinations(tables, 2))
 
 
 def fewest_points(intervals):

@@ -15,12 +15,13 @@ from hybridtrack.analyses._linearisation import (
     PRINTED,
     errors,
     from_expressions,
+    lattice,
     matters,
 )
 from hybridtrack.analyses._local_starts import local_starts
 from hybridtrack.analyses._objective import SOLVERS, Objective
 from hybridtrack.analyses._placement import majorant, pierce, place_one, weights_of_cells
-from hybridtrack.analyses._placement_several import place_several, worst_of_several
+from hybridtrack.analyses._placement_search import descend, search
 from hybridtrack.analyses._procedure import Procedure, Range, System
 from hybridtrack.analyses._steady_ellipsoids import (
     BEST_CONSTANTS,
@@ -29,6 +30,7 @@ from hybridtrack.analyses._steady_ellipsoids import (
     with_box,
     with_constants,
 )
+from hybridtrack.analyses._worst_errors import worst_error
 
 X, Y, PSI = sympy.symbols("x y psi", real=True)
 AIRCRAFT = (
@@ -210,8 +212,8 @@ def test_weights_of_cells_enclose_the_curvature():
         assert high - low < 0.1 * 0.08  # the step times the steepest slope
 
 
-def test_where_curvature_changes_its_sign_the_bound_holds_and_nothing_is_claimed():
-    """cos over [0, pi] for the exact error: E is more than the error, and there is a doubt."""
+def test_where_curvature_changes_its_sign_no_interval_is_served():
+    """cos over [0, pi] for the exact error: E is more than the error, so it isn't minimised."""
     function = aircraft()
     bound = majorant(function, 0.0, math.pi)
     rng = np.random.default_rng(3)
@@ -222,11 +224,46 @@ def test_where_curvature_changes_its_sign_the_bound_holds_and_nothing_is_claimed
     assert (found > 1.01 * exact).any()
     same_sign = (pairs < math.pi / 2).all(axis=1)
     np.testing.assert_allclose(found[same_sign], exact[same_sign], rtol=1e-7, atol=1e-15)
-    placement = place_one(function, EXACT, 0.0, math.pi, 3)
-    assert math.isnan(placement.no_less_than)
-    assert "curvature of x changes its sign" in placement.doubt
-    by_hand = reference.worst_error(reference.exact_error, placement.points[:, 0], 0.0, math.pi)
-    assert by_hand == pytest.approx(placement.worst_error, rel=1e-4)
+    assert place_one(function, EXACT, 0.0, math.pi, 3) is None
+
+
+CHANGING = {
+    "cube": (X**3, lambda x, c: np.abs((x - c) ** 2 * (x + 2 * c)), -1.0, 1.0),
+    "sine": (
+        sympy.sin(X),
+        lambda x, c: np.abs(np.sin(x) - np.sin(c) - np.cos(c) * (x - c)),
+        -3.0,
+        3.0,
+    ),
+}
+
+
+@pytest.mark.parametrize(("count", "fineness"), [(1, 801), (2, 301), (3, 101)])
+@pytest.mark.parametrize("name", CHANGING)
+def test_where_curvature_changes_its_sign_no_points_of_a_grid_are_better(name, count, fineness):
+    """All combinations; x^3 over [-1, 1] has 1/2 at -1/2 or 1/2, by hand."""
+    expression, by_hand, low, high = CHANGING[name]
+    placement = search(one_state(expression), EXACT, np.array([low]), np.array([high]), count, 0)
+    worst = reference.worst_error(by_hand, placement.points[:, 0], low, high)
+    assert worst <= placement.worst_error * (1 + 1e-9)
+    assert worst == pytest.approx(placement.worst_error, rel=1e-3)
+    grid = np.linspace(low, high, fineness)
+    best, _ = reference.exhaustive(by_hand, count, grid, places=2001, low=low, high=high)
+    # judged on 2,001 places the grid's best is told too small, by less than this
+    assert placement.worst_error <= best * 1.002
+    assert placement.no_less_than <= best * 1.002
+    assert placement.no_less_than > 0.96 * placement.worst_error
+    if (name, count) == ("cube", 1):
+        assert placement.worst_error == pytest.approx(0.5, rel=1e-5)
+        assert abs(placement.points[0, 0]) == pytest.approx(0.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("expression", [sympy.exp(X), X**2, 1 / (X + 4)])
+def test_the_certificate_of_a_convex_map_is_tight(expression):
+    """Where the curvature keeps away from 0 nothing is left for a sign that was not seen."""
+    placement = place_one(one_state(expression), EXACT, -1.0, 1.0, 3)
+    assert placement.certificate
+    assert placement.no_less_than == pytest.approx(placement.worst_error, rel=1e-9)
 
 
 def test_enclosures_hold_and_end_at_a_pole():
@@ -259,24 +296,41 @@ def test_squares_are_covered_by_squares(count, optimum):
     """
     function = from_expressions(("x", "y"), (X**2 / 2, Y**2 / 2), (X, Y), ("x", "y"), np.ones(2))
     low, high = np.zeros(2), np.ones(2)
-    placement = place_several(function, PRINTED, low, high, count, 1, restarts=2)
+    placement = search(function, PRINTED, low, high, count, 1)
+    assert placement.worst_error == pytest.approx(optimum, rel=2e-3)
     assert placement.worst_error >= optimum * (1 - 1e-9)
-    # the search judges on lattices of 24 and 50 places a side, whose cells are 8 % of an error
-    assert placement.worst_error == pytest.approx(optimum, rel=0.05)
-    assert math.isnan(placement.no_less_than)
-    assert "nothing certifies it" in placement.doubt
-    checked, _ = worst_of_several(function, PRINTED, low, high, placement.points)
-    assert checked == pytest.approx(placement.worst_error, rel=1e-9)
+    assert 0.5 * optimum < placement.no_less_than <= optimum * (1 + 1e-9)
+    assert not placement.certificate
+    by_hand = reference.worst_of_squares(placement.points)
+    assert by_hand <= placement.worst_error * (1 + 1e-7)  # peaks are known to 1e-9 of the range
+    assert by_hand == pytest.approx(placement.worst_error, rel=0.02)
 
 
 @pytest.mark.parametrize("kind", [PRINTED, EXACT])
 def test_the_global_search_finds_the_certified_optimum_in_one_state(kind):
     certified = place_one(aircraft(), kind, float(reference.LOW), float(reference.HIGH), 3)
-    found = place_several(aircraft(), kind, *BOX, 3, 0, restarts=2)
+    found = search(aircraft(), kind, *BOX, 3, 0)
     assert found.worst_error >= certified.no_less_than
     assert found.worst_error == pytest.approx(certified.worst_error, rel=2e-3)
-    again = place_several(aircraft(), kind, *BOX, 3, 0, restarts=2)
+    # the linear programme's bound is below the optimum, and not far
+    assert found.no_less_than <= certified.worst_error
+    assert found.no_less_than == pytest.approx(certified.worst_error, rel=0.03)
+    again = search(aircraft(), kind, *BOX, 3, 0)
     np.testing.assert_array_equal(found.points, again.points)
+
+
+@pytest.mark.parametrize("kind", [PRINTED, EXACT])
+def test_no_points_of_a_grid_are_below_the_bound_in_two_states(kind):
+    """x y, whose second derivative has no definite sign: all pairs of a grid."""
+    product = from_expressions(("x", "y"), (X * Y,), (X, Y), ("x",), np.ones(1))
+    low, high = -np.ones(2), np.array([1.0, 0.5])
+    placement = search(product, kind, low, high, 2, 0)
+    factor = {PRINTED: 2.0, EXACT: 1.0}[kind]
+    best = factor * reference.best_pair_for_a_product(low, high)
+    assert placement.no_less_than <= best * (1 + 1e-9)
+    assert placement.no_less_than > 0.4 * best
+    # the grid's pairs are judged on a grid, which misses what lies between
+    assert placement.worst_error <= 1.06 * best
 
 
 # ---- local starts ----------------------------------------------------------------------------
@@ -310,13 +364,41 @@ def test_no_local_start_beats_the_optimum_and_solvers_differ(steps):
         ]
         assert min(by_hand) >= optimum.no_less_than * (1 - 1e-3)
         np.testing.assert_allclose(by_hand, one.worst_errors, rtol=3e-3)
-        shares = [one.share_within(p, optimum.worst_error) for p in (0.5, 10, 50, 5000)]
-        assert shares == sorted(shares)
-        assert shares[-1] == 1.0
-        assert shares[1] > 0.2
+        for percent in (10, 50, 100):  # of 60 starts one or two may lie on the edge
+            within = np.mean(np.array(by_hand) <= (1 + percent / 100) * optimum.worst_error)
+            share = one.share_within(percent, optimum.worst_error)
+            assert share == pytest.approx(within, abs=2.5 / 60)
+        assert one.share_within(10, optimum.worst_error) > 0.2
     within = {one.solver: one.share_within(10.0, optimum.worst_error) for one in study}
     # by 60 starts a share has a standard error of .06: far apart means far apart
     assert within["sqp_by_region"] > within["nelder_mead"] + 0.2
+
+
+def test_the_worst_place_is_found_along_edges_where_models_are_equally_wrong():
+    """Of x y, against grids of 2.4 million places: points that a search ended at, by hand."""
+    product = from_expressions(("x", "y"), (X * Y,), (X, Y), ("x",), np.ones(1))
+    x, y = np.meshgrid(np.linspace(-1, 1, 1601), np.linspace(-1, 0.5, 1501))
+    rng = np.random.default_rng(8)
+    low, high = -np.ones(2), np.array([1.0, 0.5])
+    for _ in range(6):
+        start = rng.uniform(low, high, (3, 2))
+        _, points = descend(product, EXACT, lattice(low, high, 400), low, high, start)
+        worst, place = worst_error(product, EXACT, low, high, points)
+        by_hand = np.min([np.abs((x - a) * (y - b)) for a, b in points], axis=0).max()
+        assert by_hand * (1 - 1e-6) <= worst <= by_hand * 1.005
+        there = min(abs((place[0] - a) * (place[1] - b)) for a, b in points)
+        assert there == pytest.approx(worst, rel=1e-9)
+
+
+def test_local_ends_in_two_states_are_told_by_their_worst_place_not_by_the_solvers():
+    """Of x y the tangent at (a, b) is off by (x - a)(y - b), which is largest in a corner."""
+    product = from_expressions(("x", "y"), (X * Y,), (X, Y), ("x",), np.ones(1))
+    study = local_starts(product, EXACT, -np.ones(2), np.array([1.0, 0.5]), 2, 5, 3)
+    for one in study:
+        for points, worst in zip(one.points, one.worst_errors, strict=True):
+            x, y = np.meshgrid(np.linspace(-1, 1, 801), np.linspace(-1, 0.5, 601))
+            by_hand = np.min([np.abs((x - a) * (y - b)) for a, b in points], axis=0).max()
+            assert by_hand * (1 - 1e-3) <= worst <= by_hand * 1.01
 
 
 # ---- steady ellipsoids -----------------------------------------------------------------------
@@ -363,14 +445,31 @@ def test_best_constants_are_the_best(procedure):
             assert other is None or other[2, 2] >= found.shape[2, 2] * (1 - 1e-9)
 
 
-def test_a_steady_state_is_one_and_every_start_ends_there():
-    """Turned with the heading: the bound on psi is the same for every linear model."""
-    C, Q, R = reference.C, reference.Q, reference.R
-    bounds = [
-        steady(reference.jacobian(psi), C, Q, R, "trace_trace").half_widths[2]
-        for psi in (0.0, 0.7, 1.5)
-    ]
-    np.testing.assert_allclose(bounds, bounds[0], rtol=1e-6)
+@pytest.mark.parametrize("rule", ORACLES)
+@pytest.mark.parametrize("psi", [0.0, 0.7, 1.5])
+def test_one_step_more_leaves_a_steady_state_as_it_is(rule, psi):
+    """By the printed equations; and by symmetry psi is bounded alike at every heading."""
+    A, C, Q, R = reference.jacobian(psi), reference.C, reference.Q, reference.R
+    found = steady(A, C, Q, R, rule)
+    beta_rule, rho_rule = rule.split("_")
+    moved = A @ found.shape @ A.T
+    P = reference.added(moved, Q, reference.BETA[beta_rule](moved, Q))
+    again = reference.fused(P, reference.RHO[rho_rule](P))
+    std = found.half_widths
+    np.testing.assert_allclose(
+        again / np.outer(std, std), found.shape / np.outer(std, std), atol=1e-6
+    )
+    at_zero = steady(reference.jacobian(0.0), C, Q, R, rule)
+    assert found.half_widths[2] == pytest.approx(at_zero.half_widths[2], rel=1e-6)
+
+
+def test_what_doubling_has_lost_is_no_ellipsoid():
+    """A pendulum at its top with the best constants: no state's square is below 0."""
+    A = np.array([[1.0, 0.1], [0.981, 0.95]])
+    C, Q, R = np.array([[1.0, 0.0]]), 1e-4 * np.eye(2), np.array([[0.01]])
+    for scale in (1.0, 1e2, 1e4):
+        found = steady(A, C, scale * Q, R, BEST_CONSTANTS)
+        assert found is None or (np.diagonal(found.shape) > 0.0).all()
 
 
 @pytest.mark.parametrize("rule", NAMES)
@@ -438,3 +537,68 @@ def test_a_measurement_that_is_not_linear_has_a_remainder_too():
     np.testing.assert_allclose(
         weighed.place(RANGE, 2).points, linear.place(RANGE, 2).points, atol=1e-9
     )
+
+
+# ---- what a reader met -----------------------------------------------------------------------
+
+
+UNIT = (-np.ones(1), np.ones(1))
+
+
+def one_state(expression):
+    return from_expressions(("x",), (expression,), (X,), ("x",), np.ones(1))
+
+
+def test_a_search_is_no_worse_than_what_others_chose():
+    best = np.array([[-0.4554], [0.4554]])  # x^3, two points, by hand: 2 c^3 = (1 + c)^2 (1 - 2 c)
+    found = search(one_state(X**3), EXACT, *UNIT, 2, 0, [best])
+    assert found.worst_error <= 2 * 0.4554**3 * (1 + 1e-3)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", [PRINTED, EXACT])
+def test_a_pole_between_the_places_of_a_lattice_doesn_t_break_the_search(kind):
+    pole = 1 / ((X - sympy.Float(0.1234567)) ** 2 + (Y - sympy.Float(0.7654321)) ** 2)
+    function = from_expressions(("x", "y"), (pole,), (X, Y), ("x",), np.ones(1))
+    placement = search(function, kind, np.zeros(2), np.ones(2), 1, 0)
+    assert not placement.worst_error < 1e6
+
+
+def test_an_error_that_rounding_makes_rough_is_covered():
+    from hybridtrack.analyses._placement import _walk, smallest_level
+
+    function = one_state(X + sympy.Float(0.1) * sympy.sin(X))
+    bound = majorant(function, -2.0, 2.0)
+    for count in range(1, 7):
+        smallest_level(lambda q, n=count: _walk(bound, -2.0, 2.0, q, n), 0.5)
+
+
+def test_without_process_noise_nothing_crashes():
+    no, one = np.zeros((1, 1)), np.eye(1)
+    for rule in NAMES:
+        found = steady(0.5 * one, one, no, one, rule)
+        assert found is None or found.half_widths[0] <= 0.5 + 1e-9
+
+
+def test_what_is_not_finite_has_no_steady_ellipsoid():
+    one = np.eye(1)
+    assert steady(np.full((1, 1), np.nan), one, one, one, "trace_trace") is None
+    assert steady(one, one, np.full((1, 1), np.inf), one, "trace_trace") is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_not_measured_at_a_place_divides_by_nothing():
+    one = np.eye(1)
+    for rule in NAMES:
+        steady(0.9 * one, np.zeros((1, 1)), one, one, rule)
+
+
+def test_local_solvers_end_at_the_same_parts_of_any_range():
+    scale = sympy.Float(1e-5)
+    small = one_state(scale * sympy.sin(X / scale))
+    ends = []
+    for function, high in ((one_state(sympy.sin(X)), 1.0), (small, 1e-5)):
+        box = (np.zeros(1), np.array([high]))
+        ends.append([o.worst_errors / high for o in local_starts(function, EXACT, *box, 2, 8, 1)])
+    # the last bits send some starts elsewhere
+    assert np.isclose(ends[0], ends[1], rtol=1e-2).mean() > 0.85

@@ -8,6 +8,8 @@ import pytest
 
 from hybridtrack import config
 from hybridtrack.analyses import analyses
+from hybridtrack.analyses._operating_tables import place
+from hybridtrack.analyses._operating_words import share
 from hybridtrack.config.schema import ANALYSIS_FORMS
 from hybridtrack.errors import Unsuited
 from test_cli import hybridtrack
@@ -165,7 +167,11 @@ def test_what_is_not_met_by_the_most_points_is_said():
     ("settings", "number", "words"),
     [
         ((f"{SETTING}range={{psi: [0, 1000000]}}",), 1, "other places may be better by up to"),
-        ((f"{SETTING}range={{psi: [-3, 3]}}", f"{SETTING}remainder=exact"), 1, "not certified"),
+        (
+            (f"{SETTING}range={{psi: [-3, 3]}}", f"{SETTING}remainder=exact"),
+            1,
+            "Other places may be better by up to",
+        ),
         (("dynamics.x=x + exp(20*psi)", f"{SETTING}wanted={{}}"), 0, "has no steady state"),
         (
             (f"{SETTING}wanted={{}}", f"{SETTING}most_points=2"),
@@ -181,7 +187,7 @@ def test_what_is_less_certain_is_said(settings, number, words):
 
 def test_another_scenario_in_two_states(monkeypatch):
     """v cos(psi), its speed in the range too: nothing is certified, and it says so."""
-    monkeypatch.setattr("hybridtrack.analyses._placement_several.RESTARTS", 1)
+    monkeypatch.setattr("hybridtrack.analyses._placement_search.RESTARTS", 6)
     found = findings(
         "constants={T: 0.01, w1: 0.5}",
         "inputs={}",
@@ -195,6 +201,7 @@ def test_another_scenario_in_two_states(monkeypatch):
         "estimators={ESMF: {type: esmf}}",
         "compare_with=ESMF",
         "published=[]",
+        "source=mine",
         f"{SETTING}range={{psi: [0, 1.5], v1: [8, 12]}}",
         f"{SETTING}placements={{}}",
         f"{SETTING}least_points=2",
@@ -202,9 +209,22 @@ def test_another_scenario_in_two_states(monkeypatch):
     )
     optimal = rows(found.table)[1:]
     assert [row["points"] for row in optimal] == [1, 2]
-    assert all(row["certificate"] is None and "restarts" in row["doubt"] for row in optimal)
+    assert all(row["certificate"] is None and "starts" in row["doubt"] for row in optimal)
+    assert all(0.5 < row["no_less_than"] / row["worst_error"] < 1 for row in optimal)
     assert optimal[1]["worst_error"] < 0.5 * optimal[0]["worst_error"]
     assert "not certified" in found.conclusions[1]
+    # where they stand is shown, one line for each point
+    assert [name for name, table in found.tables.items() if table.shown] == ["points"]
+    cells = found.tables["points"].shown
+    assert list(cells) == ["points", "point", "psi", "v1"]
+    assert cells["points"] == ["1", "2", "2"]
+    assert [float(cell) for cell in cells["v1"]] == pytest.approx(
+        found.tables["points"].columns["v1"], abs=0.001
+    )
+    # and a stranger's scenario is told nothing of equations it has never seen
+    assert not any(
+        "(" + number in note for note in found.notes for number in ("22", "31", "32", "40")
+    )
     assert [chart.name for chart in found.charts] == [
         "linearisation_error_psi",
         "linearisation_error_v1",
@@ -235,7 +255,10 @@ LINEAR = ("dynamics.x=x + T*v1", "dynamics.y=y")
         ([f"{SETTING}placements={{mine: [[0, 1]]}}"], ("needs 1 number for each",)),
         ([f"{SETTING}placements={{optimal: [1]}}"], ("can't be called 'optimal'",)),
         (["dynamics.x=x + 1/(psi - 1)"], ("no value at psi = 1",)),
-        (["dynamics.x=x + log(1.2 - psi)"], ("no value at psi = 1.2",)),
+        (
+            ["dynamics.x=x + log(1.8 - psi)", f"{SETTING}range={{psi: [0, 2]}}"],
+            ("no value at psi = 1.8",),
+        ),
         (["measurement={x: x}", "noise.measurement={x: 0.09}", LINEAR[0]], ("no steady state",)),
         (
             ["inputs.v0=[" + ", ".join(["1", "2"] * 157) + "]", "dynamics.y=y + T*v0*sin(psi)"],
@@ -293,3 +316,50 @@ def test_an_analysis_is_the_same_twice():
     assert first.table == second.table
     assert first.tables == second.tables
     assert not any(math.isnan(e) for e in first.tables["local_starts"].columns["worst_error"])
+
+
+def test_shares_are_0_and_100_per_cent_only_where_they_are():
+    assert [share(part) for part in (0.0, 0.01, 0.55, 0.983, 1.0)] == [
+        *("0 %", "under 10 %", "60 %", "over 90 %", "100 %")
+    ]
+
+
+def test_places_have_the_digits_of_their_range():
+    assert place(0.7853981, 1.57) == "0.785"
+    assert place(-1e-9, 4.0) == "0.000"
+    assert place(2.63e-6, 1e-5) == "2.63e-06"
+    assert place(12345.6, 2e5) == "1.23e+04"
+
+
+def test_every_bound_that_is_wanted_is_shown():
+    found = findings(
+        *(f"{SETTING}wanted={{psi: 2.5, x: 0.2}}", f"{SETTING}placements={{}}", "published=[]"),
+        f"{SETTING}least_points=1",
+    )
+    shown = found.table.shown
+    assert [heading for heading in shown if heading.startswith("bound")] == [
+        *("bound\npsi", "bound\nx")
+    ]
+    row = rows(found.table)[1]
+    assert float(shown["bound\nx"][1]) == pytest.approx(row["bound_x"], rel=1e-3)
+    assert row["meets_wanted"] == (row["bound_psi"] <= 2.5 and row["bound_x"] <= 0.2)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_its_words_don_t_hang_on_last_bits_nor_on_the_draw(seed):
+    """Shares of starts are told to a fifth: of 1,000 they have a standard error of .016."""
+    found = findings(f"{SETTING}starts=1000", f"monte_carlo.seed={seed}")
+    (said,) = (sentence for sentence in found.conclusions if "starts" in sentence)
+    assert said.endswith(
+        "end, to the nearest fifth, 80 % by sqp, over 90 % by sqp_by_region, 60 % by nelder_mead: "
+        "the solver decides."
+    )
+    (coarse,) = (row["share_within_10_percent_sqp"] for row in rows(found.table)[3:4])
+    assert coarse == pytest.approx(0.8)
+    raw = rows(found.tables["shares"])
+    (exact,) = (
+        row["share_of_starts"]
+        for row in raw
+        if (row["solver"], row["within_percent"]) == ("sqp", 10)
+    )
+    assert 0.75 < exact < 0.87  # nowhere near the edges, .7 and .9

@@ -1,6 +1,6 @@
 """Bounds of a derivative over intervals that hold for certain, by python-flint's balls."""
 
-import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,20 @@ def largest_size(expression: Any, symbol: Any, edges: Array) -> Array:
 
     Infinite where there is none.
     """
+    return largest_sizes(expression, (symbol,), edges[:-1, np.newaxis], edges[1:, np.newaxis])
+
+
+def largest_sizes(expression: Any, symbols: Sequence[Any], low: Array, high: Array) -> Array:
+    """The same (n,) over boxes low (n, d), high (n, d) of d symbols."""
     import sympy
     from flint import arb
 
-    function = sympy.lambdify([symbol], expression, modules=[ball_functions()])
-    result = np.full(len(edges) - 1, np.inf)
-    for i, (low, high) in enumerate(itertools.pairwise(edges)):
+    function = sympy.lambdify(list(symbols), expression, modules=[ball_functions()])
+    result = np.full(len(low), np.inf)
+    for i, (begin, end) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+        balls = [arb(a).union(arb(b)) for a, b in zip(begin, end, strict=True)]
         try:
-            found = arb(function(arb(float(low)).union(arb(float(high)))))
+            found = arb(function(*balls))
         except (ZeroDivisionError, ValueError):
             continue
         result[i] = max(map(abs, ends(found)))

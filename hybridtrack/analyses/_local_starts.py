@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridtrack.analyses._linearisation import Nonlinear
-from hybridtrack.analyses._objective import SOLVERS, Objective
+from hybridtrack.analyses._objective import SOLVERS, Scaled
+from hybridtrack.analyses._worst_errors import peaks
 from hybridtrack.models import Array
 
 WITHIN_PERCENT = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -31,21 +32,18 @@ def local_starts(
     function: Nonlinear, kind: str, low: Array, high: Array, count: int, starts: int, seed: int
 ) -> list[LocalStarts]:
     """Every solver from the same starts, uniform in the box low (d,), high (d,)."""
-    import warnings
-
     rng = np.random.default_rng([seed, count])
     begun = rng.uniform(low, high, (starts, count, len(low)))
-    objective = Objective(function, kind, (low, high), count)
+    objective = Scaled(function, kind, (low, high), count)
+    parts = ((begun - low) / (high - low)).reshape(starts, -1)
+    ended = [objective.ends(start) for start in parts]
     found = []
-    for name, solver in SOLVERS.items():
-        ends = np.empty_like(begun)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a solver's steps out of bounds, which it clips
-            for i, start in enumerate(begun):
-                end = np.clip(solver(objective, start.ravel()).reshape(objective.shape), low, high)
-                # a solver that gave up below where it began hasn't gone anywhere
-                failed = not objective.worst(end.ravel()) <= objective.worst(start.ravel())
-                ends[i] = start if failed else end
-        worst = np.array([objective.worst(end.ravel()) for end in ends])
-        found.append(LocalStarts(name, ends, worst))
+    for name in SOLVERS:
+        ends = np.array([one[name] for one in ended])
+        points = np.clip(low + (high - low) * ends.reshape(begun.shape), low, high)
+        if objective.ordered:
+            worst = np.array([objective.worst(end) for end in ends])
+        else:  # between a solver's places, few in each state, there are worse ones
+            worst = np.array([peaks(function, kind, low, high, one)[0].max() for one in points])
+        found.append(LocalStarts(name, points, worst))
     return found

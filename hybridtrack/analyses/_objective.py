@@ -4,12 +4,14 @@ Eq. 33 of Otanez 2004 is a largest error of best models: it has kinks wherever a
 worst, and many local minima. In one state meetings of regions are interpolated between places.
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from hybridtrack.analyses._linearisation import Nonlinear, lattice, on_places
+from hybridtrack.analyses._linearisation import Nonlinear, largest_on_places, lattice
+from hybridtrack.compiled import kernel
 from hybridtrack.models import Array
 
 PLACES = 201  # of a range of one state: what lies between is interpolated
@@ -35,7 +37,7 @@ class Objective:
         self.ordered = len(low) == 1
         if places is None:
             places = lattice(low, high, PLACES if self.ordered else PLACES_OF_SEVERAL)
-        self._errors = on_places(function, kind, places)
+        self._errors = largest_on_places(function, kind, places)
         self._nudge = NUDGE * (high - low)
         self.box = list(
             zip(np.tile(low, count).tolist(), np.tile(high, count).tolist(), strict=True)
@@ -43,7 +45,7 @@ class Objective:
 
     def by_region(self, points: Array) -> Array:
         """The largest error (n,) in the region that each model is the best in; 0 if it has none."""
-        return self._regions(self._largest(points.reshape(self.shape)))
+        return self._regions(self._errors(points.reshape(self.shape)))
 
     def worst(self, points: Array) -> float:
         """The largest of these."""
@@ -54,7 +56,7 @@ class Objective:
         count, d = self.shape
         at = points.reshape(self.shape)
         moved = at[:, np.newaxis] + np.diag(self._nudge)  # (n, d, d): one coordinate each
-        found = self._largest(np.vstack([at, moved.reshape(-1, d)]))
+        found = self._errors(np.vstack([at, moved.reshape(-1, d)]))
         still = found[:, :count]
         before = self._regions(still)
         result = np.empty((count, count * d))
@@ -64,37 +66,62 @@ class Objective:
             result[:, k] = (self._regions(tried) - before) / self._nudge[k % d]
         return result, before
 
-    def _largest(self, at: Array) -> Array:
-        """The errors (m, n) of points (n, d), of whichever component is the worst."""
-        found = self._errors(at)
-        # over an axis so short, one comparison after the other is three times as fast as max
-        result: Array = found[:, :, 0]
-        for j in range(1, found.shape[2]):
-            result = np.maximum(result, found[:, :, j])
-        return result
-
     def _regions(self, found: Array) -> Array:
-        """Of errors (m, n): each model's largest, with those where two regions meet.
-
-        Along one state a meeting lies between two places; there both errors are interpolated, or
-        the objective would be a staircase that solvers get stuck on.
-        """
-        owner = found.argmin(axis=1)
-        own = found[np.arange(len(found)), owner]
-        models = range(found.shape[1])
-        result = np.array([own.max(where=owner == i, initial=0.0) for i in models])
-        if not self.ordered:
-            return result
-        left = np.flatnonzero(owner[:-1] != owner[1:])
-        a, b = owner[left], owner[left + 1]
-        a_left, b_left = found[left, a], found[left, b]
-        a_right, b_right = found[left + 1, a], found[left + 1, b]
-        total = (b_left - a_left) + (a_right - b_right)
-        part = np.divide(b_left - a_left, total, out=np.zeros_like(total), where=total > 0.0)
-        meeting = a_left + part * (a_right - a_left)
-        np.maximum.at(result, a, meeting)
-        np.maximum.at(result, b, meeting)
+        """Of errors (m, n): each model's largest where it is the best; 0 if it is nowhere."""
+        result: Array = largest_by_region(found, self.ordered)
         return result
+
+
+@kernel
+def largest_by_region(found: Array, ordered: bool) -> Array:
+    """Of errors (m, n) at places: each model's largest (n,) where it is the best; 0 if nowhere.
+
+    ordered: along one state a meeting of two regions lies between two places; there both errors are
+    interpolated, or the objective would be a staircase that solvers get stuck on.
+    """
+    m, n = found.shape
+    result = np.zeros(n)
+    before = -1
+    for row in range(m):
+        owner = 0
+        for i in range(1, n):
+            if found[row, i] < found[row, owner]:
+                owner = i
+        result[owner] = max(result[owner], found[row, owner])
+        if ordered and row > 0 and owner != before:
+            falls = found[row - 1, owner] - found[row - 1, before]
+            total = falls + found[row, before] - found[row, owner]
+            part = falls / total if total > 0.0 else 0.0
+            left = found[row - 1, before]
+            meeting = left + part * (found[row, before] - left)
+            result[before] = max(result[before], meeting)
+            result[owner] = max(result[owner], meeting)
+        before = owner
+    return result
+
+
+class Scaled(Objective):
+    """The same of points that are parts of the range, 0 to 1: solvers' steps have no unit."""
+
+    def __init__(
+        self, function: Nonlinear, kind: str, box: tuple[Array, Array], count: int
+    ) -> None:
+        super().__init__(function, kind, box, count)
+        low, high = box
+        judged, width = self._errors, high - low
+        self._errors = lambda parts: judged(low + width * parts)
+        self._nudge = np.full(len(low), NUDGE)
+        self.box = [(0.0, 1.0)] * (count * len(low))
+
+    def ends(self, start: Array) -> dict[str, Array]:
+        """Where every solver ends (n d,), by its name; what gave up above its start, there."""
+        found = {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a solver's steps out of bounds, which it clips
+            for name, solver in SOLVERS.items():
+                end = np.clip(solver(self, start), 0.0, 1.0)
+                found[name] = end if self.worst(end) <= self.worst(start) else start
+        return found
 
 
 # ---- solvers ---------------------------------------------------------------------------------

@@ -30,7 +30,9 @@ def _error(design: Design, state: int) -> Chart:
     name = f"linearisation_error_{states[state]}" if several else "linearisation_error"
     others = ", worst over the other states" * several
     caption = f"Linearisation error over the range of {states[state]}{others}"
-    return Chart(name, caption, states[state], [Panel("error of the\nbest model", lines)])
+    unit = " (rad)" if states[state] in design.procedure.system.angles else ""
+    label = f"{states[state]}{unit}"
+    return Chart(name, caption, label, [Panel("error of the\nbest model", lines)])
 
 
 def _ends(design: Design) -> Chart:
@@ -42,10 +44,10 @@ def _ends(design: Design) -> Chart:
         values = np.sort(one.worst_errors) / scale
         share = np.arange(1, len(values) + 1, dtype=float)
         lines.append(Line(one.solver, share, values, steps="pre"))
-    all_of_them = np.array([1.0, float(design.settings.starts)])
+    all_of_them = np.array([1.0, float(design.starts)])
     level = np.full(2, 1.1 * optimum / scale)
-    lines.append(Line("110 % of the optimum", all_of_them, level, reference=True))
-    caption = f"Objective where {design.settings.starts:,} local starts end, in ascending order"
+    lines.append(Line(f"110 % of the {design.best}", all_of_them, level, reference=True))
+    caption = f"Objective where {design.starts:,} local starts end, in ascending order"
     panel = Panel("normalised\nworst error", lines, log_y=True)
     return Chart("local_starts", caption, "start", [panel])
 
@@ -59,5 +61,5 @@ def _shares(design: Design) -> Chart:
         for one in design.study
     ]
     panel = Panel("share of starts", lines, (), [Mark("10 %", x=10.0)], y_limits=(-0.02, 1.02))
-    caption = "Share of local starts that end within a percentage of the optimum"
-    return Chart("share_of_starts", caption, "per cent above the optimum", [panel])
+    caption = f"Share of local starts that end within a percentage of the {design.best}"
+    return Chart("share_of_starts", caption, f"per cent above the {design.best}", [panel])

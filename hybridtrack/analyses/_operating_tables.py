@@ -7,10 +7,12 @@ from typing import Any
 from hybridtrack.analyses import Table
 from hybridtrack.analyses._local_starts import WITHIN_PERCENT
 from hybridtrack.analyses._objective import SOLVERS
-from hybridtrack.analyses._operating_design import WITHOUT, Design
-from hybridtrack.analyses._placement import Placement
+from hybridtrack.analyses._operating_design import RESERVED, WITHOUT, Design
 from hybridtrack.analyses._procedure import Procedure, Range, Step
-from hybridtrack.analyses._steady_ellipsoids import NAMES, Steady
+from hybridtrack.analyses._steady_ellipsoids import NAMES
+from hybridtrack.analyses._worst_errors import Placement
+
+MOST_DECIMALS = 5
 
 
 def row_of(
@@ -18,26 +20,29 @@ def row_of(
     over: Range,
     label: str,
     step: Step | None,
-    settled: Steady | None,
+    rule: str,
     state: int,
 ) -> dict[str, Any]:
-    """A row of the main table; step None: without remainder."""
+    """A row of the main table; step None: without remainder.
+
+    Each state's bound is that of the model with the widest one on it.
+    """
+
+    def bank(by: str, of: int) -> float | None:
+        if step is None:
+            found = procedure.smallest(over, by, of)
+        else:
+            found = procedure.bank(step.placement.points, step.radius, by, of)
+        return None if found is None else float(found.half_widths[of])
+
     row: dict[str, Any] = {"placement": label, "points": 0}
     names = procedure.system.state_names
     if step is None:
         row |= {"worst_error": 0.0, "normalised_error": 0.0}
-        banks = {rule: procedure.smallest(over, rule, state) for rule in NAMES}
     else:
-        placement = step.placement
-        row |= _of_placement(procedure, over, placement)
-        banks = {rule: procedure.bank(placement.points, step.radius, rule, state) for rule in NAMES}
-    for j, name in enumerate(names):
-        row[f"bound_{name}"] = None if settled is None else float(settled.half_widths[j])
-    for rule, bank in banks.items():
-        row[f"bound_{names[state]}_{rule}"] = (
-            None if bank is None else float(bank.half_widths[state])
-        )
-    return row
+        row |= _of_placement(procedure, over, step.placement)
+    row |= {f"bound_{name}": bank(rule, j) for j, name in enumerate(names)}
+    return row | {f"bound_{names[state]}_{by}": bank(by, state) for by in NAMES}
 
 
 def _of_placement(procedure: Procedure, over: Range, placement: Placement) -> dict[str, Any]:
@@ -75,7 +80,7 @@ def table_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Table:
     return Table({name: [row.get(name) for row in rows] for name in names})
 
 
-def rules(design: Design, smallest: Steady) -> Table:
+def rules(design: Design) -> Table:
     """Every rule's steady ellipsoid for every placement, of the widest model."""
     procedure, rows = design.procedure, []
     names = procedure.system.state_names
@@ -100,7 +105,38 @@ def points(design: Design) -> Table:
             row = {"placement": step.name, "points": len(step.placement.points), "point": i + 1}
             states = design.procedure.function.states
             rows.append(row | dict(zip(states, map(float, point), strict=True)))
-    return table_of(rows, list(rows[0]))
+    table = table_of(rows, list(rows[0]))
+    states = design.procedure.function.states
+    return table if len(states) == 1 else table._replace(shown=_coordinates(design, rows))
+
+
+def _coordinates(design: Design, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Where the points stand, as a terminal shows it; in one state the main table has it."""
+    low, high = design.over
+    cells = {
+        "points": [named(row["placement"], row["points"]) for row in rows],
+        "point": [str(row["point"]) for row in rows],
+    }
+    for i, state in enumerate(design.procedure.function.states):
+        width = float(high[i] - low[i])
+        cells[state] = [place(row[state], width) for row in rows]
+    return cells
+
+
+def named(label: str, count: int) -> str:
+    """A placement in a terminal's first column."""
+    if not count:
+        return "noise alone"
+    return str(count) if label in RESERVED else f"{count}: {label}"
+
+
+def place(value: float, width: float) -> str:
+    """To about four digits of the range's width; no minus before what rounds to 0."""
+    decimals = 3 - math.floor(math.log10(width))
+    rounded = round(value, decimals) + 0.0
+    if 0 <= decimals <= MOST_DECIMALS:
+        return f"{rounded:.{decimals}f}"
+    return f"{rounded:.4g}"
 
 
 def ends(design: Design) -> Table:

@@ -4,7 +4,8 @@ Placing N points so that the worst place of a range is served best is a covering
 level of error each place x is served by an interval of points; walking from the left and setting
 each point as far right as the leftmost unserved place allows needs the fewest points of all (the
 greedy piercing of intervals). So a bisection on the level finds the optimum of eq. 33 of Otanez
-2004, which local solvers miss from most starts.
+2004, which local solvers miss from many starts. The exact error of a function whose second
+derivative changes its sign is served by no interval; there `_placement_search` looks.
 """
 
 import functools
@@ -15,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridtrack.analyses._enclosures import largest_size
-from hybridtrack.analyses._linearisation import EXACT, Nonlinear, lattice, of_bank
+from hybridtrack.analyses._linearisation import EXACT, Nonlinear
+from hybridtrack.analyses._worst_errors import Placement, worst_error
 from hybridtrack.models import Array
 
 CELLS = 65_536  # of the range; the certificate's gap is about the error times 3/CELLS
@@ -23,7 +25,7 @@ ENCLOSED = 128  # intervals that fourth derivatives are enclosed over
 SIGNS = 4096  # cells that a second derivative's sign is looked up at
 ROUNDING = 1e-12  # of its largest value: what has no sign
 HALVINGS = 60
-CHECKED = 20_001  # places that an error is looked up at
+BISECTIONS = 50  # of a place: to 1e-15 of what is left of the range
 
 CERTIFICATE = "greedy covering, bisected"
 NOT_ENCLOSED = "the fourth derivative has no enclosure, so errors are those of a lattice"
@@ -31,18 +33,13 @@ NOT_ENCLOSED = "the fourth derivative has no enclosure, so errors are those of a
 Cover = Callable[[float], list[float] | None]  # points that serve the range at a level, or None
 
 
-class Placement(NamedTuple):
-    """Points, the worst error of the bank that is linearised there, and what is known of it."""
+def place_one(
+    function: Nonlinear, kind: str, low: float, high: float, count: int
+) -> Placement | None:
+    """The best `count` points in [low, high] for a function of one state.
 
-    points: Array  # (n, d), ascending where d = 1
-    worst_error: float  # over the range, weighted
-    no_less_than: float  # no placement of as many has a smaller one; NaN where that isn't known
-    certificate: str  # what makes it the optimum; empty where nothing does
-    doubt: str = ""  # why it may not be the optimum
-
-
-def place_one(function: Nonlinear, kind: str, low: float, high: float, count: int) -> Placement:
-    """The best `count` points in [low, high] for a function of one state."""
+    None for the exact error of what has a second derivative that changes its sign there.
+    """
     if kind == EXACT:
         return _place_exact(function, low, high, count)
     return _place_printed(function, kind, low, high, count)
@@ -137,7 +134,7 @@ def _place_printed(
     _, _, points = smallest_level(lambda q: pierce(edges, upper, q, count), highest)
     below, _, _ = smallest_level(lambda q: pierce(edges, lower, q, count), highest)
     chosen = _filled(points, count)
-    worst = worst_of_one(function, kind, low, high, chosen)
+    worst, _ = worst_error(function, kind, np.array([low]), np.array([high]), chosen)
     if not certain:
         return Placement(chosen, worst, math.nan, "", NOT_ENCLOSED)
     return Placement(chosen, max(worst, below), below, CERTIFICATE, "")
@@ -199,8 +196,17 @@ def majorant(function: Nonlinear, low: float, high: float) -> Majorant:
         kept = np.flatnonzero(own)
         changes = kept[:-1][own[kept[:-1]] != own[kept[1:]]]
         follow = kept[1:][own[kept[:-1]] != own[kept[1:]]]
+        fine = min(2e-12, 1e-13 * (high - low))
         roots = [
-            float(brentq(lambda x, j=j: function.hessian(np.array([[x]]))[0, j, 0, 0], a, b))
+            float(
+                brentq(
+                    lambda x, j=j: function.hessian(np.array([[x]]))[0, j, 0, 0],
+                    *(a, b),
+                    xtol=fine,
+                    full_output=True,
+                    disp=False,
+                )[0]
+            )
             for a, b in zip(nodes[changes], nodes[follow], strict=True)
         ]
         starts.append(np.array([low, *roots]))
@@ -228,26 +234,37 @@ def _farthest(error: Callable[[float], float], start: float, high: float, level:
 
     if error(high) <= level:
         return high
-    return float(brentq(lambda x: error(x) - level, start, high, xtol=1e-14, rtol=1e-14))
+    fine = min(1e-14, 1e-13 * (high - start))
+    place, answer = brentq(
+        lambda x: error(x) - level,
+        *(start, high),
+        xtol=fine,
+        rtol=1e-14,
+        full_output=True,
+        disp=False,
+    )
+    return float(place) if answer.converged else _halved(error, start, high, level)
 
 
-def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Placement:
+def _halved(error: Callable[[float], float], served: float, unserved: float, level: float) -> float:
+    """By bisection, which an error that rounding makes rough doesn't hold up."""
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (served + unserved)
+        if error(middle) <= level:
+            served = middle
+        else:
+            unserved = middle
+    return served
+
+
+def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Placement | None:
     bound = majorant(function, low, high)
+    if any(len(starts) > 1 for starts in bound.starts):
+        return None
     highest = bound.error(low, high) + bound.error(high, low)
-    below, level, points = smallest_level(lambda q: _walk(bound, low, high, q, count), highest)
+    below, _, points = smallest_level(lambda q: _walk(bound, low, high, q, count), highest)
     chosen = _filled(points, count)
-    worst = worst_of_one(function, EXACT, low, high, chosen)
-    changing = [
-        name
-        for name, starts in zip(function.components, bound.starts, strict=True)
-        if len(starts) > 1
-    ]
-    if changing:
-        doubt = (
-            f"the curvature of {' and '.join(changing)} changes its sign in the range: placed by a "
-            f"bound of the error ({level:.4g}), which is the error itself only where it doesn't"
-        )
-        return Placement(chosen, worst, math.nan, "", doubt)
+    worst, _ = worst_error(function, EXACT, np.array([low]), np.array([high]), chosen)
     slack = _unseen(function, low, high)
     if math.isinf(slack):
         return Placement(chosen, worst, math.nan, "", NOT_ENCLOSED)
@@ -258,38 +275,24 @@ def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Pl
 def _unseen(function: Nonlinear, low: float, high: float) -> float:
     """How far E may be above the error by changes of sign between two places that were looked at.
 
-    There f'' is no farther beyond 0 than max |f''''| h^2/8, or than what was taken for rounding,
-    and E exceeds the error by twice its integral over at most the range.
+    In a cell f'' is beyond 0 by no more than max |f''''| h^2/8 less its distance from 0 at the
+    cell's ends; what was taken for rounding may have any sign. E exceeds the error by at most twice
+    the integral of what is beyond 0, times the range: nothing where f'' keeps away from 0.
     """
     edges = np.linspace(low, high, SIGNS + 1)
     bend, certain = _bends(function, edges)
     if not certain:
         return math.inf
-    curvature = np.abs(function.hessian(edges[:, np.newaxis])[:, :, 0, 0]).max(axis=0)
-    depth = bend.max(axis=0) * ((high - low) / SIGNS) ** 2 / 8.0
-    return float((depth + ROUNDING * curvature * function.weights).max()) * (high - low) ** 2
-
-
-# ---- both ------------------------------------------------------------------------------------
+    curvature = function.hessian(edges[:, np.newaxis])[:, :, 0, 0] * function.weights
+    one, other = curvature[:-1], curvature[1:]
+    faint = ROUNDING * np.abs(curvature).max(axis=0)
+    distance = np.where(one * other > 0.0, np.minimum(np.abs(one), np.abs(other)), 0.0)
+    width = (high - low) / SIGNS
+    beyond = np.maximum(bend * width**2 / 8.0 - np.where(distance > faint, distance, 0.0), 0.0)
+    beyond += np.where(np.minimum(np.abs(one), np.abs(other)) <= faint, faint, 0.0)
+    return float(2.0 * (beyond.sum(axis=0) * width).max()) * (high - low)
 
 
 def _filled(points: list[float], count: int) -> Array:
     """As many points as asked for: where fewer serve as well, the last one again."""
     return np.array(points + points[-1:] * (count - len(points)))[:, np.newaxis]
-
-
-def worst_of_one(function: Nonlinear, kind: str, low: float, high: float, points: Array) -> float:
-    """The largest error over the range, of a fine lattice with what lies between its best cells."""
-    from scipy.optimize import minimize_scalar
-
-    x = lattice(np.array([low]), np.array([high]), CHECKED)
-    found = of_bank(function, kind, x, points)
-    peak = int(found.argmax())
-    begin, end = x[max(peak - 1, 0), 0], x[min(peak + 1, len(x) - 1), 0]
-    best = minimize_scalar(
-        lambda place: -float(of_bank(function, kind, np.array([[place]]), points)[0]),
-        bounds=(begin, end),
-        method="bounded",
-        options={"xatol": 1e-12},
-    )
-    return max(float(found[peak]), -float(best.fun))

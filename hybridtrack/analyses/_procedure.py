@@ -20,13 +20,16 @@ from hybridtrack.analyses._linearisation import (
     of_bank,
     radii,
 )
-from hybridtrack.analyses._placement import CHECKED, Placement, place_one, worst_of_one
-from hybridtrack.analyses._placement_several import place_several, worst_of_several
-from hybridtrack.analyses._steady_ellipsoids import Steady, steady, with_box
+from hybridtrack.analyses._placement import place_one
+from hybridtrack.analyses._placement_search import search
+from hybridtrack.analyses._steady_ellipsoids import BEST_CONSTANTS, Steady, steady, with_box
+from hybridtrack.analyses._worst_errors import Placement, checked, worst_error
 from hybridtrack.models import Array
 
 NARROWED, NARROWINGS = 64, 3  # cells that a pole is looked for in, and again in those with one
-SAMPLED = 9  # places of the range that the smallest bound is looked for at
+OPTIMAL, BEST_FOUND = "optimal", "best found"  # with a certificate, and without
+TRIED = 9  # places of the range that the smallest bound is looked for at, and about the best again
+ALIKE = 1e-6  # relative: bounds that don't depend on the place
 
 
 class System(NamedTuple):
@@ -42,6 +45,7 @@ class System(NamedTuple):
     measurement: tuple[Any, ...]  # (n_y,)
     process_noise: Array  # Q (n_x, n_x)
     measurement_noise: Array  # R (n_y, n_y)
+    angles: tuple[str, ...] = ()  # the states in radians
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -94,26 +98,28 @@ class Procedure:
         self._measurement = compiled(slopes[1], own, (n_y, n_x))
         self._known: dict[tuple[Any, ...], Steady | None] = {}
 
-    def place(self, over: Range, count: int) -> Placement:
-        """Steps 2 and 3: the best `count` points."""
+    def place(self, over: Range, count: int, others: Sequence[Array] = ()) -> Placement:
+        """Steps 2 and 3: the best `count` points.
+
+        Where that is a search, it starts from others too, (n, d) of as many or of one fewer, and is
+        no worse than those.
+        """
         if len(over.low) == 1:
-            return place_one(
-                self.function, self.kind, float(over.low[0]), float(over.high[0]), count
-            )
-        return place_several(self.function, self.kind, over.low, over.high, count, self.seed)
+            low, high = float(over.low[0]), float(over.high[0])
+            found = place_one(self.function, self.kind, low, high, count)
+            if found is not None:
+                return found
+        known = [points for points in others if count - 1 <= len(points) <= count]
+        return search(self.function, self.kind, *over, count, self.seed, known)
 
     def given(self, over: Range, points: Array) -> Placement:
         """The worst error of points (n, d) that someone else chose."""
-        if len(over.low) == 1:
-            low, high = float(over.low[0]), float(over.high[0])
-            worst = worst_of_one(self.function, self.kind, low, high, points)
-        else:
-            worst, _ = worst_of_several(self.function, self.kind, over.low, over.high, points)
+        worst, _ = worst_error(self.function, self.kind, *over, points)
         return Placement(points, worst, float("nan"), "")
 
     def radius(self, over: Range, placement: Placement) -> Array:
         """The worst error (k,) of each component; the largest is the placement's own."""
-        x = lattice(over.low, over.high, CHECKED)
+        x = checked(*over)
         found = radii(self.function, self.kind, x, placement.points)
         # what lies between the places of the lattice
         scale = placement.worst_error / max(float((found * self.function.weights).max()), 1e-300)
@@ -126,7 +132,7 @@ class Procedure:
 
     def largest_curvature(self, over: Range) -> float:
         """The largest second derivative in the range, weighted."""
-        return largest_curvature(self.function, lattice(over.low, over.high, CHECKED))
+        return largest_curvature(self.function, checked(*over))
 
     def bank(self, points: Array, radius: Array | None, rule: str, state: int) -> Steady | None:
         """The steady ellipsoid of the model with the widest bound on a state; None if one has none.
@@ -141,11 +147,19 @@ class Procedure:
     def smallest(self, over: Range, rule: str, state: int) -> Steady | None:
         """Step 1: without remainder, linearised where in the range the bound is the smallest.
 
-        None where there is none anywhere.
+        Of a few places, and of as many about the best of them. None where there is none at any.
         """
-        places = lattice(over.low, over.high, SAMPLED)
-        found = [one for one in self._each(places, None, rule, state) if one is not None]
-        return min(found, key=lambda one: float(one.half_widths[state]), default=None)
+        places = lattice(*over, TRIED)
+        found = list(self._each(places, None, rule, state))
+        bounds = [np.inf if one is None else float(one.half_widths[state]) for one in found]
+        best = int(np.argmin(bounds))
+        if np.isfinite(bounds[best]) and max(bounds) > (1.0 + ALIKE) * bounds[best]:
+            step = (over.high - over.low) / (round(len(places) ** (1.0 / len(over.low))) - 1)
+            low = np.maximum(places[best] - step, over.low)
+            high = np.minimum(places[best] + step, over.high)
+            found += self._each(lattice(low, high, TRIED), None, rule, state)
+        kept = [one for one in found if one is not None]
+        return min(kept, key=lambda one: float(one.half_widths[state]), default=None)
 
     def _each(
         self, points: Array, radius: Array | None, rule: str, state: int
@@ -159,7 +173,8 @@ class Procedure:
         Q = with_box(system.process_noise, whole[:n_x])
         R = with_box(system.measurement_noise, whole[n_x:])
         for A, C in zip(self._dynamics(points), self._measurement(points), strict=True):
-            key = (A.tobytes(), C.tobytes(), Q.tobytes(), R.tobytes(), rule, state)
+            own = state if rule == BEST_CONSTANTS else 0  # what the others weigh has no state
+            key = (A.tobytes(), C.tobytes(), Q.tobytes(), R.tobytes(), rule, own)
             if key not in self._known:
                 self._known[key] = steady(A, C, Q, R, rule, state)
             yield self._known[key]
@@ -170,12 +185,25 @@ class Procedure:
         return Step(name, placement, radius, self.bank(placement.points, radius, rule, state))
 
     def steps(
-        self, over: Range, rule: str, wanted: Mapping[int, float], least: int, most: int
+        self,
+        over: Range,
+        rule: str,
+        wanted: Mapping[int, float],
+        least: int,
+        most: int,
+        others: Sequence[Array] = (),
     ) -> Iterator[Step]:
-        """Steps 2 to 5: until the bounds wanted, by state, are met and `least` points tried."""
+        """Steps 2 to 5: until the bounds wanted, by state, are met and `least` points tried.
+
+        others: points (n, d) of any number, that the best of as many may be no worse than.
+        """
+        before: list[Array] = []  # of one point fewer
         state = next(iter(wanted), 0)
         for count in range(1, most + 1):
-            step = self.step(over, "optimal", self.place(over, count), rule, state)
+            placement = self.place(over, count, [*before, *others])
+            name = OPTIMAL if placement.certificate else BEST_FOUND
+            step = self.step(over, name, placement, rule, state)
+            before = [placement.points]
             yield step
             if count >= least and wanted and self.meets(step, rule, wanted):
                 return
@@ -190,7 +218,7 @@ class Procedure:
 
     def not_finite(self, over: Range) -> Array | None:
         """A place (d,) of the range where the function or a derivative has no value, if any."""
-        x = lattice(over.low, over.high, CHECKED)
+        x = checked(*over)
         parts: Sequence[Array] = (
             self.function.value(x),
             self.function.jacobian(x).reshape(len(x), -1),
@@ -224,7 +252,7 @@ class Procedure:
 
 def profile(procedure: Procedure, over: Range, points: Array, state: int) -> tuple[Array, Array]:
     """The bank's error along one state of the range, worst over the others: places and errors."""
-    x = lattice(over.low, over.high, CHECKED // 20 if len(over.low) == 1 else CHECKED)
+    x = lattice(*over, 1_001) if len(over.low) == 1 else checked(*over)
     found = of_bank(procedure.function, procedure.kind, x, points)
     along, owner = np.unique(x[:, state], return_inverse=True)
     worst = np.zeros(len(along))

@@ -47,7 +47,7 @@ class Steady(NamedTuple):
 def beta_of_trace(moved: Array, noise: Array) -> float:
     """Of the smallest trace of M/(1 - beta) + N/beta: sqrt(tr N)/(sqrt(tr M) + sqrt(tr N))."""
     one, two = math.sqrt(np.trace(moved)), math.sqrt(np.trace(noise))
-    return two / (one + two) if two > 0.0 else 0.0
+    return _inside(two / (one + two)) if two > 0.0 else 0.0
 
 
 def beta_of_determinant(moved: Array, noise: Array) -> float:
@@ -92,9 +92,14 @@ def rho_of_determinant(P: Array, C: Array, R: Array) -> float:
 def rho_of_eigenvalues(P: Array, C: Array, R: Array) -> float:
     """sqrt(r)/(sqrt(p) + sqrt(r)) of the largest eigenvalues of R and C P C' (Scholte, Campbell
     2003): no search, and safe, but not the smallest."""
-    p = math.sqrt(np.linalg.eigvalsh(C @ P @ C.T)[-1])
-    r = math.sqrt(np.linalg.eigvalsh(R)[-1])
-    return r / (p + r)
+    p = math.sqrt(max(np.linalg.eigvalsh(C @ P @ C.T)[-1], 0.0))
+    r = math.sqrt(max(np.linalg.eigvalsh(R)[-1], 0.0))
+    return _inside(r / (p + r))
+
+
+def _inside(weight: float) -> float:
+    """Not so near to 0 or 1 that a set is divided by it."""
+    return min(max(weight, NEAR), 1.0 - NEAR)
 
 
 def _seen(P: Array, C: Array, R: Array) -> tuple[Array, Array]:
@@ -142,9 +147,9 @@ NAMES = (*RULES, BEST_CONSTANTS)
 def steady(A: Array, C: Array, Q: Array, R: Array, rule: str, state: int = 0) -> Steady | None:
     """The steady ellipsoid of A (n, n), C (n_y, n), Qhat (n, n), R (n_y, n_y); None without one.
 
-    state: the one that the best constants make the bound of smallest.
+    state: the one that the best constants make the bound of smallest. What isn't finite has none.
     """
-    if not seen(A, C):
+    if not all(np.isfinite(part).all() for part in (A, C, Q, R)) or not seen(A, C):
         return None
     if rule == BEST_CONSTANTS:
         return best_constants(A, C, Q, R, state)
@@ -162,6 +167,8 @@ def steady(A: Array, C: Array, Q: Array, R: Array, rule: str, state: int = 0) ->
         fused = intersection(predicted, C, R, rho)
         if not np.trace(fused) < GROWN * largest:
             return None
+        if not Q.any() and np.trace(fused) < largest / GROWN**2:
+            return Steady(np.zeros_like(fused), beta, rho)  # without noise it shrinks to a point
         std = np.sqrt(np.maximum(np.diagonal(fused), 0.0))  # of huge noise rounding may be left
         if (np.abs(fused - shape) <= SETTLED * np.outer(std, std)).all():
             return Steady(fused, beta, rho)
@@ -206,7 +213,11 @@ def with_constants(A: Array, C: Array, Q: Array, R: Array, beta: float, rho: flo
     """
     grown = A / math.sqrt((1.0 - beta) * (1.0 - rho))
     wide = _riccati(grown, C.T @ np.linalg.solve(R / rho, C), Q / (beta * (1.0 - rho)))
-    return None if wide is None else intersection((1.0 - rho) * wide, C, R, rho)
+    if wide is None:
+        return None
+    shape = intersection((1.0 - rho) * wide, C, R, rho)
+    # doubling that has lost its digits may end in what is no ellipsoid
+    return shape if (np.diagonal(shape) >= 0.0).all() else None
 
 
 def _riccati(A: Array, information: Array, Q: Array) -> Array | None:
@@ -238,7 +249,9 @@ def best_constants(A: Array, C: Array, Q: Array, R: Array, state: int) -> Steady
         beta, rho = _weights(logits)
         with np.errstate(all="ignore"):  # what grows for good
             shape = with_constants(A, C, Q, R, beta, rho)
-        return math.inf if shape is None else math.log(shape[state, state])
+        # without noise an ellipsoid shrinks to a point, which no constants keep
+        found = 0.0 if shape is None else float(shape[state, state])
+        return math.log(found) if 0.0 < found < math.inf else math.inf
 
     tried = [np.array([b, r]) for b in (-5.0, -3.0, -1.0) for r in (-5.0, -3.0, -1.0)]
     start = min(tried, key=size)

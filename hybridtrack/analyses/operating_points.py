@@ -2,8 +2,9 @@
 
 Otanez, Campbell 2004, section III-B: the bound that noise alone leaves, then 1, 2, ... operating
 points at the places of the smallest largest linearisation error, until the steady ellipsoid is
-within what is wanted. In one state the placement is the global optimum; in several it is the best
-that restarts find. Beside it, what local solvers make of the same problem.
+within what is wanted. In one state the placement is the global optimum where the curvature
+keeps its sign; elsewhere, and in several states, the best found, with a lower bound. Beside it,
+what local solvers make of the same problem.
 """
 
 import math
@@ -13,10 +14,14 @@ from typing import Any
 import numpy as np
 
 from hybridtrack.analyses import Analysis, Findings, Measured
+from hybridtrack.analyses._linearisation import lattice
 from hybridtrack.analyses._local_starts import LocalStarts, local_starts
 from hybridtrack.analyses._operating_charts import charts
 from hybridtrack.analyses._operating_design import (
-    OPTIMAL,
+    PAPER,
+    RESERVED,
+    STARTS,
+    STARTS_OF_SEVERAL,
     TEN,
     WITHOUT,
     Design,
@@ -33,18 +38,19 @@ from hybridtrack.analyses._operating_tables import (
     table_of,
 )
 from hybridtrack.analyses._operating_words import conclusions, notes, shown
-from hybridtrack.analyses._procedure import Procedure, Range, System
-from hybridtrack.analyses._steady_ellipsoids import Steady
+from hybridtrack.analyses._procedure import TRIED, Procedure, Range, Step, System
+from hybridtrack.analyses._worst_errors import worst_error
 from hybridtrack.description import Experiment
 from hybridtrack.errors import Unsuited
 from hybridtrack.expressions import number
 from hybridtrack.models import Array
 
 MOST_STATES = 3  # that points are placed in
+BEYOND = 1e3  # times what the curvature that was seen allows an error
 
 
 def _analyse(experiment: Experiment, settings: Settings, measured: Measured | None) -> Findings:
-    return findings(system_of(experiment), settings, experiment.seed)
+    return findings(system_of(experiment), settings, experiment.seed, PAPER in experiment.source)
 
 
 def system_of(experiment: Experiment) -> System:
@@ -76,38 +82,49 @@ def system_of(experiment: Experiment) -> System:
         measurement=tuple(one.subs(inputs) for one in measurement.expressions),
         process_noise=model.process_noise_shape,
         measurement_noise=model.measurement_noise_shape,
+        angles=tuple(model.state_names[i] for i in model.angles),
     )
 
 
-def findings(system: System, settings: Settings, seed: int) -> Findings:
-    """All of it for a system. Raises Unsuited."""
+def findings(system: System, settings: Settings, seed: int, of_paper: bool = False) -> Findings:
+    """All of it for a system; of_paper: whose equations notes may name. Raises Unsuited."""
     weights = _weights(system, settings)
     procedure = Procedure(system, settings.remainder, weights, seed)
     over = _range(procedure, settings)
+    if settings.starts is None:
+        several = len(over.low) > 1
+        settings = settings._replace(starts=STARTS_OF_SEVERAL if several else STARTS)
     wanted = _wanted(system, settings)
     state = next(iter(wanted), system.state_names.index(procedure.function.states[0]))
-    smallest = _smallest(procedure, over, settings.rule, state, wanted)
+    _refuse_unattainable(procedure, over, settings.rule, state, wanted)
     least = max(settings.least_points, settings.starts_points if settings.starts else 1)
     most = max(settings.most_points, least)
-    steps = list(procedure.steps(over, settings.rule, wanted, least, most))
-    given = [
-        procedure.step(over, label, procedure.given(over, points), settings.rule, state)
-        for label, points in _placements(over, settings).items()
-    ]
-    met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
-    needed = met.index(True) + 1 if True in met else None
     study: list[LocalStarts] = []
     if settings.starts:
         count = settings.starts_points
         study = local_starts(
             procedure.function, settings.remainder, *over, count, settings.starts, seed
         )
-    rows = [row_of(procedure, over, WITHOUT, None, smallest, state)]
+    placements = _placements(over, settings)
+    others = [*placements.values(), *(one.points[one.worst_errors.argmin()] for one in study)]
+    steps = []
+    for step in procedure.steps(over, settings.rule, wanted, least, most, others):
+        _refuse_pole(procedure, over, step)
+        steps.append(step)
+    given = [
+        procedure.step(over, label, procedure.given(over, points), settings.rule, state)
+        for label, points in placements.items()
+    ]
+    for step in given:
+        _refuse_pole(procedure, over, step)
+    met = [procedure.meets(step, settings.rule, wanted) for step in steps] if wanted else []
+    needed = met.index(True) + 1 if True in met else None
+    rows = [row_of(procedure, over, WITHOUT, None, settings.rule, state)]
     for step in (*steps, *given):
-        row = row_of(procedure, over, step.name, step, step.steady, state)
+        row = row_of(procedure, over, step.name, step, settings.rule, state)
         if wanted:
             row["meets_wanted"] = procedure.meets(step, settings.rule, wanted)
-        if step.name == OPTIMAL and len(step.placement.points) == settings.starts_points:
+        if step.name in RESERVED and len(step.placement.points) == settings.starts_points:
             for one in study:
                 share = one.share_within(TEN, step.placement.worst_error)
                 row[f"share_within_10_percent_{one.solver}"] = coarse(share)
@@ -116,13 +133,13 @@ def findings(system: System, settings: Settings, seed: int) -> Findings:
         row["points_needed"] = needed
     if wanted:
         rows[0]["meets_wanted"] = True
-    design = Design(procedure, over, wanted, state, steps, given, study, needed, settings)
+    design = Design(procedure, over, wanted, state, steps, given, study, needed, settings, of_paper)
     return Findings(
         table=table_of(rows, columns(procedure, design))._replace(shown=shown(design, rows)),
         conclusions=conclusions(design, rows),
         notes=notes(design),
         tables={
-            "rules": rules(design, smallest),
+            "rules": rules(design),
             "points": points(design),
             "local_starts": ends(design),
             "shares": shares(design),
@@ -207,6 +224,26 @@ def _range(procedure: Procedure, settings: Settings) -> Range:
     return over
 
 
+def _refuse_pole(procedure: Procedure, over: Range, step: Step) -> None:
+    """Where an error has no bound, between the places that were looked at before."""
+    width = float(np.linalg.norm(over.high - over.low))
+    most = BEYOND * procedure.largest_curvature(over) * width**2
+    if step.placement.worst_error <= most:
+        return
+    where = ""
+    if len(over.low) > 1:
+        _, place = worst_error(procedure.function, procedure.kind, *over, step.placement.points)
+        names = procedure.function.states
+        listed = ", ".join(f"{s} = {v:.4g}" for s, v in zip(names, place, strict=True))
+        where = f" about {listed}"
+    raise Unsuited(
+        f"the dynamics, or their derivatives, have no bound{where}; choose a range without it",
+        "analyses",
+        "operating_points",
+        "range",
+    )
+
+
 def _those(procedure: Procedure) -> str:
     return f"the remainder depends on {' and '.join(procedure.function.states)}"
 
@@ -254,20 +291,20 @@ def _wanted(system: System, settings: Settings) -> dict[int, float]:
     return wanted
 
 
-def _smallest(
+def _refuse_unattainable(
     procedure: Procedure,
     over: Range,
     rule: str,
     state: int,
     wanted: Mapping[int, float],
-) -> Steady:
-    """Step 1, and whether what is wanted can be had at all."""
-    found = procedure.smallest(over, rule, state)
-    if found is None:
+) -> None:
+    """Step 1: where there is nothing steady, or where what is wanted can't be had at all."""
+    tried = len(lattice(*over, TRIED))
+    if procedure.smallest(over, rule, state) is None:
         raise Unsuited(
             f"without any remainder the ellipsoid has no steady state by the rule {rule} "
-            "anywhere in the range (a part of the state that doesn't decay is not measured); "
-            "choose another rule or measurement",
+            f"at any of {tried} places of the range (a part of the state that doesn't decay is not "
+            "measured); choose another rule or measurement",
             "dynamics",
         )
     for j, bound in wanted.items():
@@ -276,19 +313,19 @@ def _smallest(
         if bound < least:
             raise Unsuited(
                 f"{procedure.system.state_names[j]} is wanted within {bound:g}, and the "
-                f"noise alone leaves {least:.4g} in steady state, however many points there are; "
-                f"want at least that, or another rule than {rule}",
+                f"noise alone leaves {least:.4g} in steady state, however many points there are "
+                f"(at the best of {tried} places of the range and of as many about it); want at "
+                f"least that, or another rule than {rule}",
                 "analyses",
                 "operating_points",
                 "wanted",
             )
-    return found
 
 
 def _placements(over: Range, settings: Settings) -> dict[str, Array]:
     found, d = {}, len(over.low)
     for label, listed in (settings.placements or {}).items():
-        if label in (WITHOUT, OPTIMAL):
+        if label in RESERVED:
             raise Unsuited(
                 f"a placement can't be called '{label}'; rename it",
                 "analyses",
@@ -319,7 +356,7 @@ def _placements(over: Range, settings: Settings) -> dict[str, Array]:
 ANALYSIS = Analysis(
     name="operating-points",
     summary="how many linear models a wanted bound needs, and where to linearise",
-    source="Otanez, Campbell 2004, sections III-B and IV",
+    source=f"{PAPER}, sections III-B and IV",
     settings=Settings,
     analyse=_analyse,
     example="switched_esmf",
