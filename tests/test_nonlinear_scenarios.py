@@ -74,7 +74,7 @@ MISTAKES = [
     ("measurement: {x: x, y: y}", "measurement: {}", "'measurement' has no entries"),
     ("angles: [psi]", "angles: [phi]", "'phi' is no state and no measurement"),
     ("units: {x: m,", 'units: {x: "m\\n",', "has letters that no figure can show"),
-    ("start: [0, 0, 0]", "start: [1.0e17, 0, 0]", "where numbers are too far apart for it"),
+    ("start: [0, 0, 0]", "start: [1.0e17, 0, 0]", "where numbers are too far apart for that"),
     ("  psi: psi + T*w1\n", "  psi: ''\n", "it is empty"),
     (
         "windows: {late: {from_s: 0.3}}",

@@ -338,10 +338,10 @@ def test_every_bound_that_is_wanted_is_shown():
     )
     shown = found.table.shown
     assert [heading for heading in shown if heading.startswith("bound")] == [
-        *("bound\npsi", "bound\nx")
+        *("bound\npsi, rad", "bound\nx, m")
     ]
     row = rows(found.table)[1]
-    assert float(shown["bound\nx"][1]) == pytest.approx(row["bound_x"], rel=1e-3)
+    assert float(shown["bound\nx, m"][1]) == pytest.approx(row["bound_x"], rel=1e-3)
     assert row["meets_wanted"] == (row["bound_psi"] <= 2.5 and row["bound_x"] <= 0.2)
 
 

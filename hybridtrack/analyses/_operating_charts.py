@@ -30,9 +30,13 @@ def _error(design: Design, state: int) -> Chart:
     name = f"linearisation_error_{states[state]}" if several else "linearisation_error"
     others = ", worst over the other states" * several
     caption = f"Linearisation error over the range of {states[state]}{others}"
-    unit = " (rad)" if states[state] in design.procedure.system.angles else ""
-    label = f"{states[state]}{unit}"
-    return Chart(name, caption, label, [Panel("error of the\nbest model", lines)])
+    label = _with(states[state], design.procedure.system.units.get(states[state], ""))
+    panel = Panel(_with("error of the\nbest model", design.error_unit), lines)
+    return Chart(name, caption, label, [panel])
+
+
+def _with(words: str, unit: str) -> str:
+    return f"{words} ({unit})" if unit else words
 
 
 def _ends(design: Design) -> Chart:

@@ -63,6 +63,13 @@ class Design(NamedTuple):
         return self.procedure.system.state_names[self.state]
 
     @property
+    def error_unit(self) -> str:
+        """Of the worst error; '' where none is given, or components of several are compared."""
+        if self.settings.weights:
+            return ""
+        return self.procedure.system.error_unit(self.procedure.function.components)
+
+    @property
     def best(self) -> str:
         """What the best placements may be called: the optimum only with a certificate."""
         certain = all(step.placement.certificate for step in self.steps)

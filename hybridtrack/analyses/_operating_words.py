@@ -23,17 +23,26 @@ def shown(design: Design, rows: Sequence[Row]) -> dict[str, list[str]]:
     states = design.procedure.function.states
     cells = {
         "points": [named(row["placement"], row["points"]) for row in rows],
-        "worst\nerror": [_short(row["worst_error"]) if row["points"] else "" for row in rows],
+        f"worst\n{_of('error', design.error_unit)}": [
+            _short(row["worst_error"]) if row["points"] else "" for row in rows
+        ],
         "norm-\nalised": [_short(row["normalised_error"]) if row["points"] else "" for row in rows],
     }
     if len(states) == 1:
         width = float(design.over.high[0] - design.over.low[0])
         cells[f"at {states[0]} ="] = [_places(row, states[0], width) for row in rows]
     for name in names:
-        cells[f"bound\n{name}"] = [_short(row[f"bound_{name}"]) or "none" for row in rows]
+        unit = design.procedure.system.units.get(name, "")
+        cells[f"bound\n{_of(name, unit)}"] = [
+            _short(row[f"bound_{name}"]) or "none" for row in rows
+        ]
     if design.wanted:
         cells["with-\nin"] = [_answer(row) for row in rows]
     return cells
+
+
+def _of(words: str, unit: str) -> str:
+    return f"{words}, {unit}" if unit else words
 
 
 def _answer(row: Row) -> str:

@@ -6,6 +6,7 @@ it is within what is wanted. Here a bank's bound is its widest model's, since an
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,12 +46,17 @@ class System(NamedTuple):
     measurement: tuple[Any, ...]  # (n_y,)
     process_noise: Array  # Q (n_x, n_x)
     measurement_noise: Array  # R (n_y, n_y)
-    angles: tuple[str, ...] = ()  # the states in radians
+    units: Mapping[str, str] = MappingProxyType({})  # of states and measurements, where given
 
     @property
     def component_names(self) -> tuple[str, ...]:
         """Of f by its states, of h by what is measured."""
         return self.state_names + tuple(f"measured {name}" for name in self.measurement_names)
+
+    def error_unit(self, components: Sequence[str]) -> str:
+        """The unit that errors of some components have in common; '' where they have none."""
+        found = {self.units.get(name.removeprefix("measured "), "") for name in components}
+        return found.pop() if len(found) == 1 else ""
 
 
 class Range(NamedTuple):

@@ -82,7 +82,7 @@ def system_of(experiment: Experiment) -> System:
         measurement=tuple(one.subs(inputs) for one in measurement.expressions),
         process_noise=model.process_noise_shape,
         measurement_noise=model.measurement_noise_shape,
-        angles=tuple(model.state_names[i] for i in model.angles),
+        units=experiment.units,
     )
 
 

@@ -53,6 +53,7 @@ def build_nonlinear(form: NonlinearForm, document: Document) -> Experiment:
     _check_inputs(model, tuple(form.inputs), document)
     _check_start(model, truth.start, document)
     _check_course(model, truth.start, times_s, document)
+    _check_resolution(model, truth.start, document)
     case = Case(form.name, times_s, truth)
     nothing = ModeBank((), model.state_names, 1, None, None, np.zeros(0))
     chosen = tuple(_estimator(label, form, model, nothing, document) for label in form.estimators)
@@ -250,16 +251,22 @@ def _check_course(model: NonlinearModel, start: Array, times_s: Array, document:
             f"without noise the truth has no finite value at step {k} ({times_s[k]:g} s); end "
             "'clock' before, or change 'dynamics' or 'start'",
         )
-    shape = np.diagonal(model.initial_shape)
-    for name, largest, width in zip(
-        model.state_names, np.abs(course).max(axis=0), np.sqrt(shape), strict=True
+
+
+def _check_resolution(model: NonlinearModel, start: Array, document: Document) -> None:
+    """What the truth starts at, and what is measured of it, can be told within the half-axes."""
+    seen = model.measurement.value(start[np.newaxis], model.inputs_at(0))[0]
+    for path, names, values, shape in (
+        (("initial", "half_axes"), model.state_names, start, model.initial_shape),
+        (("noise", "measurement"), model.measurement_names, seen, model.measurement_noise_shape),
     ):
-        if width < ROUNDINGS * np.spacing(largest):
-            raise document.error(
-                ("initial", "half_axes", name),
-                f"the half-axis of '{name}' is {width:g}, and the truth reaches {largest:g}, where "
-                "numbers are too far apart for it; move the origin, or widen it",
-            )
+        for name, value, width in zip(names, values, np.sqrt(np.diagonal(shape)), strict=True):
+            if width < ROUNDINGS * np.spacing(abs(value)):
+                raise document.error(
+                    (*path, name),
+                    f"the half-axis of '{name}' is {width:g}, and it starts at {value:g}, where "
+                    "numbers are too far apart for that; move the origin, or widen it",
+                )
 
 
 def _check_inputs(model: NonlinearModel, names: tuple[str, ...], document: Document) -> None:
