@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_operating_points as reference
-from hybridtrack.analyses._enclosures import largest_size
+from hybridtrack.analyses._enclosures import first_jump, largest_size
+from hybridtrack.analyses._least_errors_of_points import least_error
 from hybridtrack.analyses._linearisation import (
     EXACT,
     PRINTED,
@@ -333,6 +334,49 @@ def test_no_points_of_a_grid_are_below_the_bound_in_two_states(kind):
     assert placement.worst_error <= 1.06 * best
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("best", [1.0, 3.0])
+def test_the_lower_bound_depends_on_no_good_guess(count, best):
+    """Of x^2 on [-1, 1] N points leave 1/N^2 at best, whatever was reached before."""
+    square = from_expressions(("x",), (X**2,), (X,), ("x",), np.ones(1))
+    found = least_error(square, EXACT, -np.ones(1), np.ones(1), count, best)
+    assert 0.9 / count**2 - 0.01 < found <= (1 + 1e-9) / count**2
+
+
+def test_a_certificate_allows_for_rounding_far_from_0():
+    """x^2 over [a, a + 1]: the optimum is 1/4, and at 1e8 no digit of it is left."""
+    square = from_expressions(("x",), (X**2,), (X,), ("x",), np.ones(1))
+    for low in (0.0, 1e3, 1e6, 1e7, 1e8):
+        placement = place_one(square, EXACT, low, low + 1.0, 1)
+        assert placement.no_less_than <= 0.25
+        assert placement.worst_error >= 0.25 * (1 - 1e-9)
+    near = place_one(square, EXACT, 0.0, 1.0, 1)
+    assert near.no_less_than == pytest.approx(0.25, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("expression", "low", "high", "place"),
+    [
+        (sympy.atan(sympy.tan(X)), 1.0, 2.0, np.pi / 2),
+        (X**2 + sympy.atan2(sympy.sin(X), sympy.cos(X)), 2.0, 4.0, np.pi),
+        (1 / (X - sympy.Rational(1, 3)), 0.0, 1.0, 1 / 3),
+    ],
+)
+def test_a_jump_is_found_between_the_places_of_a_lattice(expression, low, high, place):
+    ends = (np.array([low]), np.array([high]))
+    assert first_jump([expression], [X], *ends) == pytest.approx(place, abs=1e-3)
+    beside = (np.array([low]), np.array([place - 0.01]))
+    assert first_jump([expression], [X], *beside) is None
+
+
+def test_a_cut_is_found_in_two_states():
+    angle, low = sympy.atan2(Y, X), np.array([-4.0, -1.0])
+    found = first_jump([angle], [X, Y], low, np.array([-2.0, 1.0]))
+    assert abs(found[1]) < 1e-3
+    assert first_jump([angle], [X, Y], low, np.array([-2.0, -0.1])) is None
+    assert first_jump([angle], [X, Y], np.array([1.0, -1.0]), np.array([2.0, 1.0])) is None
+
+
 # ---- local starts ----------------------------------------------------------------------------
 
 
@@ -571,6 +615,24 @@ def test_an_error_that_rounding_makes_rough_is_covered():
     bound = majorant(function, -2.0, 2.0)
     for count in range(1, 7):
         smallest_level(lambda q, n=count: _walk(bound, -2.0, 2.0, q, n), 0.5)
+
+
+def test_the_widest_model_is_a_bank_s_bound(procedure):
+    """Where the models differ, by each alone."""
+    points = np.array([[0.1], [0.8], [1.5]])
+    alone = [procedure.bank(one[None], None, "trace_trace", 0).half_widths[0] for one in points]
+    assert max(alone) > 1.05 * min(alone)
+    bank = procedure.bank(points, None, "trace_trace", 0)
+    assert bank.half_widths[0] == pytest.approx(max(alone), rel=1e-12)
+
+
+@pytest.mark.parametrize("rule", [*NAMES])
+@pytest.mark.parametrize("noise", [(0.01, 0.01), (0.01, 0.0), (0.0, 0.0)])
+def test_two_that_decay_alike_and_are_seen_as_one_crash_no_rule(rule, noise):
+    """Their difference isn't seen: what grows for good loses its digits, and has no ellipsoid."""
+    A, C = np.array([[0.95, 0.1], [0.0, 0.95]]), np.array([[1.0, 1.0]])
+    found = steady(A, C, np.diag(noise) ** 2, np.array([[0.01]]), rule, 1)
+    assert found is None or np.isfinite(found.shape).all()
 
 
 def test_without_process_noise_nothing_crashes():

@@ -154,6 +154,15 @@ def test_points_are_added_until_what_is_wanted_is_met():
     assert "with one point fewer it is 0.582" in found.conclusions[0]
 
 
+def test_no_more_points_are_tried_than_the_most():
+    found = findings(
+        *(f"{SETTING}most_points=2", f"{SETTING}placements={{}}", "published=[]"),
+        *(f"{SETTING}wanted=null", f"{SETTING}starts=20"),
+    )
+    assert max(row["points"] for row in rows(found.table)) == 2
+    assert "with 2 points" in " ".join(found.conclusions)
+
+
 def test_what_is_not_met_by_the_most_points_is_said():
     found = findings(
         *(f"{SETTING}wanted={{psi: 0.46}}", f"{SETTING}most_points=2", f"{SETTING}least_points=1"),
@@ -253,6 +262,8 @@ LINEAR = ("dynamics.x=x + T*v1", "dynamics.y=y")
         ([f"{SETTING}weights={{x: 0}}"], ("weight of x is 0",)),
         ([f"{SETTING}placements={{mine: [2]}}"], ("'mine' has a point outside the range",)),
         ([f"{SETTING}placements={{mine: [[0, 1]]}}"], ("needs 1 number for each",)),
+        ([f"{SETTING}placements={{mine: []}}"], ("'mine' has no points",)),
+        (["dynamics.x=x + T*psi**2 + atan2(sin(2*psi), cos(2*psi))"], ("jumps at psi = 1.571",)),
         ([f"{SETTING}placements={{optimal: [1]}}"], ("can't be called 'optimal'",)),
         (["dynamics.x=x + 1/(psi - 1)"], ("no value at psi = 1",)),
         (
@@ -340,6 +351,8 @@ def test_every_bound_that_is_wanted_is_shown():
     assert [heading for heading in shown if heading.startswith("bound")] == [
         *("bound\npsi, rad", "bound\nx, m")
     ]
+    assert any(" bounds settle, that on psi at " in said for said in found.conclusions)
+    assert any(", that on x at 0." in said for said in found.conclusions)
     row = rows(found.table)[1]
     assert float(shown["bound\nx, m"][1]) == pytest.approx(row["bound_x"], rel=1e-3)
     assert row["meets_wanted"] == (row["bound_psi"] <= 2.5 and row["bound_x"] <= 0.2)

@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridtrack.analyses._linearisation import Nonlinear
+from hybridtrack.analyses._linearisation import Nonlinear, largest_on_places, lattice
 from hybridtrack.analyses._objective import SOLVERS, Scaled
 from hybridtrack.analyses._worst_errors import peaks
 from hybridtrack.models import Array
 
+FINE = 4001  # places of a range of one state that ends are judged at
 WITHIN_PERCENT = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
@@ -37,13 +38,20 @@ def local_starts(
     objective = Scaled(function, kind, (low, high), count)
     parts = ((begun - low) / (high - low)).reshape(starts, -1)
     ended = [objective.ends(start) for start in parts]
+    judged = largest_on_places(function, kind, lattice(low, high, FINE))
     found = []
     for name in SOLVERS:
         ends = np.array([one[name] for one in ended])
         points = np.clip(low + (high - low) * ends.reshape(begun.shape), low, high)
-        if objective.ordered:
-            worst = np.array([objective.worst(end) for end in ends])
-        else:  # between a solver's places, few in each state, there are worse ones
+        # between a solver's places, few in each state, there are worse ones
+        if len(low) == 1:
+            worst = np.array([_largest(judged(one)) for one in points])
+        else:
             worst = np.array([peaks(function, kind, low, high, one)[0].max() for one in points])
         found.append(LocalStarts(name, points, worst))
     return found
+
+
+def _largest(errors: Array) -> float:
+    """Of errors (m, n) at places, each by its best model."""
+    return float(errors.min(axis=1).max())

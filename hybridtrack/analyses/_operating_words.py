@@ -8,7 +8,7 @@ from hybridtrack.analyses._linearisation import PRINTED, lattice
 from hybridtrack.analyses._operating_design import PAPER, RESERVED, TEN, Design, coarse
 from hybridtrack.analyses._operating_tables import named, place
 from hybridtrack.analyses._procedure import TRIED
-from hybridtrack.analyses._worst_errors import Placement
+from hybridtrack.analyses._worst_errors import Placement, checked
 
 Row = Mapping[str, Any]
 
@@ -113,6 +113,8 @@ def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
         f"{design.procedure.system.state_names[j]} within {bound:g}"
         for j, bound in design.wanted.items()
     )
+    if len(design.wanted) > 1:
+        return [_of_several(design, rows, wanted)]
     if design.needed is None:
         last = bounds[most]
         settles = "has no steady state" if last is None else f"settles at {_bound(last)}"
@@ -130,6 +132,22 @@ def _how_many(design: Design, rows: Sequence[Row]) -> list[str]:
         was = "has none" if fewer is None else f"is {_bound(fewer)}"
         said_first = said_first[:-1] + f", and with one point fewer it {was}."
     return [said_first]
+
+
+def _of_several(design: Design, rows: Sequence[Row], wanted: str) -> str:
+    """How many points keep several bounds, and what they come to."""
+    names = [design.procedure.system.state_names[j] for j in design.wanted]
+    best = [row for row in rows if row["placement"] in RESERVED[1:]]
+    row = best[(design.needed or len(best)) - 1]
+    told = [(name, row[f"bound_{name}"]) for name in names]
+    settle = ", ".join(
+        f"that on {name} {'has no steady state' if bound is None else f'at {_bound(bound)}'}"
+        for name, bound in told
+    )
+    if design.needed is None:
+        return f"Even {_count(row['points'])} don't keep {wanted}: the bounds settle, {settle}."
+    few, verb = ("One point", "is") if design.needed == 1 else (_count(design.needed), "are")
+    return f"{few} {verb} enough for {wanted}: the bounds settle, {settle}."
 
 
 def _how_far(design: Design) -> list[str]:
@@ -207,6 +225,11 @@ def notes(design: Design) -> list[str]:
         f"noise alone: linearised where its bound is the smallest, of {tried} places of the range "
         "and, where they differ, of as many about the best"
     )
+    if len(design.over.low) > 1:
+        found.append(
+            f"worst errors are the largest found, of {len(checked(*design.over)):,} places and "
+            "between the highest of them; a steeper place may have been missed"
+        )
     if len(design.procedure.function.components) > 1 and not design.settings.weights:
         listed = ", ".join(design.procedure.function.components)
         found.append(f"errors of {listed} are compared as they stand; see 'weights'")

@@ -25,6 +25,7 @@ ENCLOSED = 128  # intervals that fourth derivatives are enclosed over
 SIGNS = 4096  # cells that a second derivative's sign is looked up at
 ROUNDING = 1e-12  # of its largest value: what has no sign
 HALVINGS = 60
+BITS = 16.0  # last bits of the largest value that a sum of a few terms may lose
 BISECTIONS = 50  # of a place: to 1e-15 of what is left of the range
 
 CERTIFICATE = "greedy covering, bisected"
@@ -268,7 +269,7 @@ def _place_exact(function: Nonlinear, low: float, high: float, count: int) -> Pl
     slack = _unseen(function, low, high)
     if math.isinf(slack):
         return Placement(chosen, worst, math.nan, "", NOT_ENCLOSED)
-    below = max(below - slack, 0.0)
+    below = max(below - slack - rounding(function, low, high), 0.0)
     return Placement(chosen, max(worst, below), below, CERTIFICATE, "")
 
 
@@ -291,6 +292,13 @@ def _unseen(function: Nonlinear, low: float, high: float) -> float:
     beyond = np.maximum(bend * width**2 / 8.0 - np.where(distance > faint, distance, 0.0), 0.0)
     beyond += np.where(np.minimum(np.abs(one), np.abs(other)) <= faint, faint, 0.0)
     return float(2.0 * (beyond.sum(axis=0) * width).max()) * (high - low)
+
+
+def rounding(function: Nonlinear, low: float, high: float) -> float:
+    """What last bits may be worth in an error, weighted: far from 0 values cancel."""
+    nodes = np.linspace(low, high, SIGNS + 1)[:, np.newaxis]
+    sizes = np.abs(function.value(nodes)) + np.abs(function.jacobian(nodes)[:, :, 0] * nodes)
+    return float(BITS * np.finfo(float).eps * (sizes * function.weights).max())
 
 
 def _filled(points: list[float], count: int) -> Array:

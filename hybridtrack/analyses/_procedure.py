@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridtrack.analyses._enclosures import largest_size
+from hybridtrack.analyses._enclosures import first_jump, largest_size
 from hybridtrack.analyses._linearisation import (
     Nonlinear,
     compiled,
@@ -95,6 +95,7 @@ class Procedure:
         )
         own = self.function.symbols
         others: dict[Any, int] = {s: 0 for s in system.symbols if s not in own}
+        self._alone = [e.subs(others) for e in (*system.dynamics, *system.measurement)]
         n_x, n_y = len(system.dynamics), len(system.measurement)
         slopes = [
             [sympy.diff(e, s).subs(others) for e in expressions for s in system.symbols]
@@ -235,6 +236,12 @@ class Procedure:
             result: Array = x[int(np.argmin(sound))]
             return result
         return self._pole(over) if len(over.low) == 1 else None
+
+    def jump(self, over: Range) -> Array | None:
+        """A place (d,) of the range where a value jumps, so that no second derivative bounds it."""
+        own = set(self.function.symbols)
+        expressions = [one for one in self._alone if one.free_symbols and one.free_symbols <= own]
+        return first_jump(expressions, self.function.symbols, *over)
 
     def _pole(self, over: Range) -> Array | None:
         """A place (1,) that the lattice stepped over and a second derivative is not bounded at."""

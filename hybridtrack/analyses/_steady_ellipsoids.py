@@ -229,7 +229,10 @@ def _riccati(A: Array, information: Array, Q: Array) -> Array | None:
     F, G, X = A.T, information, Q
     identity = np.eye(len(A))
     for _ in range(DOUBLINGS):
-        half = np.linalg.solve(identity + G @ X, np.hstack([F, G]))
+        try:
+            half = np.linalg.solve(identity + G @ X, np.hstack([F, G]))
+        except np.linalg.LinAlgError:  # what grows for good has lost all digits
+            return None
         through, seen = half[:, : len(A)], half[:, len(A) :]
         step = F.T @ X @ through
         X, G = X + 0.5 * (step + step.T), G + F @ seen @ F.T

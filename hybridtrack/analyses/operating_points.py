@@ -97,8 +97,9 @@ def findings(system: System, settings: Settings, seed: int, of_paper: bool = Fal
     wanted = _wanted(system, settings)
     state = next(iter(wanted), system.state_names.index(procedure.function.states[0]))
     _refuse_unattainable(procedure, over, settings.rule, state, wanted)
+    most = settings.most_points
+    settings = settings._replace(starts_points=min(settings.starts_points, most))
     least = max(settings.least_points, settings.starts_points if settings.starts else 1)
-    most = max(settings.most_points, least)
     study: list[LocalStarts] = []
     if settings.starts:
         count = settings.starts_points
@@ -210,6 +211,16 @@ def _range(procedure: Procedure, settings: Settings) -> Range:
         raise Unsuited(
             f"the dynamics, or their derivatives, have no value at {where}; choose a range "
             "without it",
+            "analyses",
+            "operating_points",
+            "range",
+        )
+    place = procedure.jump(over)
+    if place is not None:
+        where = ", ".join(f"{s} = {v:.4g}" for s, v in zip(states, place, strict=True))
+        raise Unsuited(
+            f"a value jumps at {where} or thereabouts (an angle's cut, a pole of tan), and no "
+            "linear model is good on both sides; choose a range on one side of it",
             "analyses",
             "operating_points",
             "range",
@@ -333,7 +344,14 @@ def _placements(over: Range, settings: Settings) -> dict[str, Array]:
                 "placements",
             )
         points = [point if isinstance(point, list) else [point] for point in listed]
-        if not points or any(len(point) != d for point in points):
+        if not points:
+            raise Unsuited(
+                f"the placement '{label}' has no points; give it some, or remove it",
+                "analyses",
+                "operating_points",
+                "placements",
+            )
+        if any(len(point) != d for point in points):
             raise Unsuited(
                 f"the placement '{label}' needs {d} number{'s' * (d > 1)} for each of its "
                 "points; correct it",
@@ -347,7 +365,7 @@ def _placements(over: Range, settings: Settings) -> dict[str, Array]:
                 f"the placement '{label}' has a point outside the range; move it, or widen 'range'",
                 "analyses",
                 "operating_points",
-                "range",
+                "placements",
             )
         found[label] = array
     return found
