@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import reference_operating_points as reference
+from hybridtrack.analyses import _least_errors_of_points
 from hybridtrack.analyses._enclosures import first_jump, largest_size
 from hybridtrack.analyses._least_errors_of_points import least_error
 from hybridtrack.analyses._linearisation import (
@@ -343,6 +344,16 @@ def test_the_lower_bound_depends_on_no_good_guess(count, best):
     assert 0.9 / count**2 - 0.01 < found <= (1 + 1e-9) / count**2
 
 
+@pytest.mark.parametrize("cells", [4, 12, 30])
+def test_the_lower_bound_of_few_wide_cells_is_one_too(cells, monkeypatch):
+    """A cell is credited with the best of its points, not with its middle."""
+    monkeypatch.setattr(_least_errors_of_points, "CELLS", {1: cells})
+    square = from_expressions(("x",), (X**2,), (X,), ("x",), np.ones(1))
+    for count in (1, 2):
+        found = least_error(square, EXACT, -np.ones(1), np.ones(1), count, 3.0)
+        assert found <= (1 + 1e-9) / count**2
+
+
 def test_a_certificate_allows_for_rounding_far_from_0():
     """x^2 over [a, a + 1]: the optimum is 1/4, and at 1e8 no digit of it is left."""
     square = from_expressions(("x",), (X**2,), (X,), ("x",), np.ones(1))
@@ -630,7 +641,7 @@ def test_the_widest_model_is_a_bank_s_bound(procedure):
 @pytest.mark.parametrize("noise", [(0.01, 0.01), (0.01, 0.0), (0.0, 0.0)])
 def test_two_that_decay_alike_and_are_seen_as_one_crash_no_rule(rule, noise):
     """Their difference isn't seen: what grows for good loses its digits, and has no ellipsoid."""
-    A, C = np.array([[0.95, 0.1], [0.0, 0.95]]), np.array([[1.0, 1.0]])
+    A, C = 0.95 * np.eye(2), np.array([[1.0, 1.0]])
     found = steady(A, C, np.diag(noise) ** 2, np.array([[0.01]]), rule, 1)
     assert found is None or np.isfinite(found.shape).all()
 
