@@ -25,9 +25,7 @@ class NonlinearModel(NamedTuple):
     state_names: tuple[str, ...]
     measurement_names: tuple[str, ...]
     angles: tuple[int, ...]  # the states that are angles
-    measured_angles: tuple[
-        int, ...
-    ]  # the measurements that are, which are told but for whole turns
+    measured_angles: tuple[int, ...]  # the measurements that are, told but for whole turns
     inputs: Array  # (n_steps or 1, n_u) u_k at k = 1 ..
     process_noise_shape: Array  # Q (n_x, n_x), as filters believe
     measurement_noise_shape: Array  # R (n_y, n_y), as filters believe

@@ -64,7 +64,7 @@ def _parts(path: Path) -> Iterator[RenderableType]:
     of_states = [(f"{error}:{s}", heading(s, u, error)) for s, u in units.items()]
     shown = (*ERRORS[error], *of_states, *MODES)
     if summary:
-        yield _summary("estimator", summary, ["raw", *manifest["estimators"]], shown)
+        yield _summary("estimator", summary, [RAW, *manifest["estimators"]], shown)
     comparisons = results.read_rows(path, "comparisons")
     if comparisons:
         yield ""

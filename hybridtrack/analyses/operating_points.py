@@ -152,6 +152,15 @@ def findings(system: System, settings: Settings, seed: int, of_paper: bool = Fal
 # ---- what is asked, checked ------------------------------------------------------------------
 
 
+def _unsuited(key: str, sentence: str) -> Unsuited:
+    """What is wrong with a setting."""
+    return Unsuited(sentence, "analyses", "operating_points", key)
+
+
+def _where(states: tuple[str, ...], place: Array) -> str:
+    return ", ".join(f"{s} = {v:.4g}" for s, v in zip(states, place, strict=True))
+
+
 def _range(procedure: Procedure, settings: Settings) -> Range:
     states = procedure.function.states
     if not states:
@@ -171,66 +180,50 @@ def _range(procedure: Procedure, settings: Settings) -> Range:
     example = ", ".join(f"{state}: [low, high]" for state in states if state not in given)
     for state in given:
         if state not in procedure.system.state_names:
-            raise Unsuited(
-                f"'range' has '{state}', which is no state; {_those(procedure)}",
-                "analyses",
-                "operating_points",
+            raise _unsuited(
                 "range",
+                f"'range' has '{state}', which is no state; {_those(procedure)}",
             )
         if state not in states:
-            raise Unsuited(
+            raise _unsuited(
+                "range",
                 f"'range' has '{state}', along which a linear model leaves no remainder; "
                 f"remove it, the remainder depends on {' and '.join(states)}",
-                "analyses",
-                "operating_points",
-                "range",
             )
     if example:
-        raise Unsuited(
+        raise _unsuited(
+            "range",
             f"the range of {' and '.join(s for s in states if s not in given)} is not "
             f"bounded; add analyses: {{operating_points: {{range: {{{example}}}}}}}",
-            "analyses",
-            "operating_points",
-            "range",
         )
     for state in states:
         ends = given[state]
         if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
-            raise Unsuited(
+            raise _unsuited(
+                "range",
                 f"the range of {state} is {[*map(float, ends)]}; give two finite numbers, "
                 "the lower first",
-                "analyses",
-                "operating_points",
-                "range",
             )
     low, high = (np.array([given[state][i] for state in states], dtype=float) for i in (0, 1))
     over = Range(low, high)
     place = procedure.not_finite(over)
     if place is not None:
-        where = ", ".join(f"{s} = {v:.4g}" for s, v in zip(states, place, strict=True))
-        raise Unsuited(
-            f"the dynamics, or their derivatives, have no value at {where}; choose a range "
-            "without it",
-            "analyses",
-            "operating_points",
+        raise _unsuited(
             "range",
+            f"the dynamics, or their derivatives, have no value at {_where(states, place)}; "
+            "choose a range without it",
         )
     place = procedure.jump(over)
     if place is not None:
-        where = ", ".join(f"{s} = {v:.4g}" for s, v in zip(states, place, strict=True))
-        raise Unsuited(
-            f"a value jumps at {where} or thereabouts (an angle's cut, a pole of tan), and no "
-            "linear model is good on both sides; choose a range on one side of it",
-            "analyses",
-            "operating_points",
+        raise _unsuited(
             "range",
+            f"a value jumps at {_where(states, place)} or thereabouts (an angle's cut, a pole of "
+            "tan), and no linear model is good on both sides; choose a range on one side of it",
         )
     if not procedure.largest_curvature(over) > 0.0:
-        raise Unsuited(
-            "over this range the dynamics are linear, so there is no remainder; widen it",
-            "analyses",
-            "operating_points",
+        raise _unsuited(
             "range",
+            "over this range the dynamics are linear, so there is no remainder; widen it",
         )
     return over
 
@@ -244,14 +237,10 @@ def _refuse_pole(procedure: Procedure, over: Range, step: Step) -> None:
     where = ""
     if len(over.low) > 1:
         _, place = worst_error(procedure.function, procedure.kind, *over, step.placement.points)
-        names = procedure.function.states
-        listed = ", ".join(f"{s} = {v:.4g}" for s, v in zip(names, place, strict=True))
-        where = f" about {listed}"
-    raise Unsuited(
-        f"the dynamics, or their derivatives, have no bound{where}; choose a range without it",
-        "analyses",
-        "operating_points",
+        where = f" about {_where(procedure.function.states, place)}"
+    raise _unsuited(
         "range",
+        f"the dynamics, or their derivatives, have no bound{where}; choose a range without it",
     )
 
 
@@ -263,19 +252,15 @@ def _weights(system: System, settings: Settings) -> dict[str, float]:
     weights = settings.weights or {}
     for component, weight in weights.items():
         if component not in system.component_names:
-            raise Unsuited(
+            raise _unsuited(
+                "weights",
                 f"'weights' has '{component}', which is no component; there are "
                 f"{', '.join(system.component_names)}",
-                "analyses",
-                "operating_points",
-                "weights",
             )
         if not 0.0 < weight < math.inf:
-            raise Unsuited(
-                f"the weight of {component} is {weight:g}; give a positive number",
-                "analyses",
-                "operating_points",
+            raise _unsuited(
                 "weights",
+                f"the weight of {component} is {weight:g}; give a positive number",
             )
     return weights
 
@@ -284,19 +269,15 @@ def _wanted(system: System, settings: Settings) -> dict[int, float]:
     wanted = {}
     for state, bound in (settings.wanted or {}).items():
         if state not in system.state_names:
-            raise Unsuited(
+            raise _unsuited(
+                "wanted",
                 f"'wanted' has '{state}', which is no state; there are "
                 f"{', '.join(system.state_names)}",
-                "analyses",
-                "operating_points",
-                "wanted",
             )
         if not 0.0 < bound < math.inf:
-            raise Unsuited(
-                f"the bound wanted of {state} is {bound:g}; give a positive number",
-                "analyses",
-                "operating_points",
+            raise _unsuited(
                 "wanted",
+                f"the bound wanted of {state} is {bound:g}; give a positive number",
             )
         wanted[system.state_names.index(state)] = bound
     return wanted
@@ -322,14 +303,12 @@ def _refuse_unattainable(
         own = procedure.smallest(over, rule, j)
         least = math.inf if own is None else float(own.half_widths[j])
         if bound < least:
-            raise Unsuited(
+            raise _unsuited(
+                "wanted",
                 f"{procedure.system.state_names[j]} is wanted within {bound:g}, and the "
                 f"noise alone leaves {least:.4g} in steady state, however many points there are "
                 f"(at the best of {tried} places of the range and of as many about it); want at "
                 f"least that, or another rule than {rule}",
-                "analyses",
-                "operating_points",
-                "wanted",
             )
 
 
@@ -337,35 +316,27 @@ def _placements(over: Range, settings: Settings) -> dict[str, Array]:
     found, d = {}, len(over.low)
     for label, listed in (settings.placements or {}).items():
         if label in RESERVED:
-            raise Unsuited(
-                f"a placement can't be called '{label}'; rename it",
-                "analyses",
-                "operating_points",
+            raise _unsuited(
                 "placements",
+                f"a placement can't be called '{label}'; rename it",
             )
         points = [point if isinstance(point, list) else [point] for point in listed]
         if not points:
-            raise Unsuited(
-                f"the placement '{label}' has no points; give it some, or remove it",
-                "analyses",
-                "operating_points",
+            raise _unsuited(
                 "placements",
+                f"the placement '{label}' has no points; give it some, or remove it",
             )
         if any(len(point) != d for point in points):
-            raise Unsuited(
+            raise _unsuited(
+                "placements",
                 f"the placement '{label}' needs {d} number{'s' * (d > 1)} for each of its "
                 "points; correct it",
-                "analyses",
-                "operating_points",
-                "placements",
             )
         array = np.array(points, dtype=float)
         if not ((array >= over.low) & (array <= over.high)).all():
-            raise Unsuited(
-                f"the placement '{label}' has a point outside the range; move it, or widen 'range'",
-                "analyses",
-                "operating_points",
+            raise _unsuited(
                 "placements",
+                f"the placement '{label}' has a point outside the range; move it, or widen 'range'",
             )
         found[label] = array
     return found
