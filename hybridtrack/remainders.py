@@ -90,9 +90,10 @@ def wave_range(centre: Array, low: Array, high: Array) -> Enclosed:
         t = np.stack(places)
         g = np.cos(t) - cosine + sine * (t - centre)
         size = 2.0 + np.abs(t).max(axis=0) + np.abs(centre)
-        # A place is off by a few last bits, and g is flat there; c is, and g's slope by c is up to
-        # |t - c|: that is less than this.
-        slack = ROUNDING * size * (1.0 + np.abs(t - centre).max(axis=0))
+        # A place is off by a few last bits, and g is flat there; c is by less than eps (2 + |c|),
+        # and g's slope by c is up to |t - c|: that is less than this.
+        far = np.abs(t - centre).max(axis=0)
+        slack = ROUNDING * (size + 0.25 * (2.0 + np.abs(centre)) * far)
         sound = np.isfinite(size)
     least = np.where(sound, g.min(axis=0) - slack, -np.inf)
     most = np.where(sound, g.max(axis=0) + slack, np.inf)
